@@ -1,0 +1,1 @@
+"""Camera models and extrinsics: calibration.json and its checks."""

@@ -1,0 +1,1 @@
+"""Device drivers: links, decoders, and the care of devices."""

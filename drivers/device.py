@@ -1,0 +1,122 @@
+"""What a driver is: decoder plus the care of one device.
+
+A driver connects (opens the link, configures the device), reads until told to stop, and closes. `received` is the
+one loop around all of them: it takes a lost device up again when it is back. Drivers are found by name through the
+entry point group `rigtape.drivers`, so any installed package can add one.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from threading import Event
+from typing import Any, Protocol
+
+import msgspec
+
+from drivers.samples import DeviceEvent, Received
+
+ENTRY_POINT_GROUP = "rigtape.drivers"
+RETRY_S = 0.5
+
+
+class DeviceError(Exception):
+    """A device that cannot be used now: absent, refusing, or gone. The message says what was tried."""
+
+
+class DeviceConfig(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
+    """Keys that every device in rig.yaml has.
+
+    required: without it the take does not start; a device that is not required is picked up when it appears.
+    clock: name of the clock that stamps this device; devices with one name share one clock map (default: own).
+    latency_s: known fixed time between the event and the earliest arrival of its message, subtracted after mapping.
+    """
+
+    driver: str
+    required: bool = True
+    clock: str = ""
+    latency_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSpec:
+    """One kind of sample a device sends: its kind in the recording, and the rate and size to expect.
+
+    kind: imu, gnss, pose, frames or lidar. rate_hz None: not known beforehand. bytes_per_s: on disk, raw tape included.
+    """
+
+    kind: str
+    rate_hz: float | None
+    bytes_per_s: float
+
+
+class Driver(Protocol):
+    """One device.
+
+    tick_hz, wrap_bits: unit of its `device_ticks` (wrap_bits 0: does not wrap).
+    """
+
+    tick_hz: float
+    wrap_bits: int
+    streams: tuple[StreamSpec, ...]
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What the device said of itself (serial number, firmware), empty before it was connected."""
+
+    def connect(self) -> None:
+        """Open and configure the device. Raises DeviceError with what was tried."""
+
+    def read(self, stop: Event) -> Iterator[Received]:
+        """Yield what comes until `stop` is set. Raises DeviceError when the device is lost."""
+
+    def close(self) -> None:
+        """Release the device; harmless when it is not open."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriverType:
+    """What an entry point names: the keys of the driver in rig.yaml, and how a device is made of them."""
+
+    config: type[DeviceConfig]
+    create: Callable[[str, Any], Driver]
+
+
+def driver_names() -> list[str]:
+    """All installed drivers, sorted."""
+    return sorted(point.name for point in entry_points(group=ENTRY_POINT_GROUP))
+
+
+def driver_type(name: str) -> DriverType:
+    """The driver of that name. Raises KeyError when none is installed, DeviceError when it cannot be imported."""
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.name == name:
+            try:
+                loaded: DriverType = point.load()
+            except ImportError as error:
+                raise DeviceError(f"driver {name} cannot be loaded: {error}") from error
+            return loaded
+    raise KeyError(name)
+
+
+def received(driver: Driver, stop: Event, *, connected: bool) -> Iterator[Received]:
+    """Yield what a device sends until `stop` is set, taking it up again whenever it was lost."""
+    last_error = ""
+    while not stop.is_set():
+        try:
+            if not connected:
+                driver.connect()
+            connected, last_error = True, ""
+            yield Received(events=(DeviceEvent("connected", _identity_text(driver)),))
+            yield from driver.read(stop)
+        except DeviceError as error:
+            driver.close()
+            if str(error) != last_error:  # one event for a device that stays away, not one for each attempt
+                yield Received(events=(DeviceEvent("lost" if connected else "warning", str(error)),))
+            connected, last_error = False, str(error)
+            stop.wait(RETRY_S)
+    driver.close()
+
+
+def _identity_text(driver: Driver) -> str:
+    facts = ", ".join(f"{key} {value}" for key, value in driver.identity.items())
+    return f"connected ({facts})" if facts else "connected"

@@ -1,0 +1,1 @@
+"""The recorder: live devices in, a recording out."""

@@ -1,0 +1,1 @@
+"""The recording folder on disk: writers, readers and checks."""
