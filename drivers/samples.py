@@ -148,7 +148,7 @@ class Chunk:
 class DeviceEvent:
     """Something that happened to a device: what a user must know to trust (or not) the data around it.
 
-    kind: connected, lost, gap, garbage, warning, drop, info. count: how many messages or bytes it concerns, where it is known.
+    count: how many messages or bytes it concerns, where that is known.
     """
 
     kind: Literal["connected", "lost", "gap", "garbage", "warning", "drop", "info"]
