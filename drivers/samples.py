@@ -76,15 +76,33 @@ class PoseSample:
 
 
 @dataclass(frozen=True, slots=True)
+class VideoFormat:
+    """How a camera's pictures are coded: codec by its FFmpeg name, size and rate.
+
+    extradata: the codec's headers where the stream carries them apart from the packets. pixel_format: FFmpeg name.
+    """
+
+    codec: str
+    width: int
+    height: int
+    fps: float
+    pixel_format: str
+    extradata: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class FrameSample:
     """One encoded picture of a camera, as it came.
 
     device_ticks: middle of the exposure on the camera's clock, ns. packet: the codec's bytes (H.264: Annex B).
+    exposure_s: length of the exposure, None where not known.
     """
 
     device_ticks: int
     packet: bytes
     is_keyframe: bool
+    video: VideoFormat
+    exposure_s: float | None
 
 
 @dataclass(frozen=True, slots=True)
