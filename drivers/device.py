@@ -50,14 +50,19 @@ class StreamSpec:
 
 
 class Driver(Protocol):
-    """One device.
+    """One device, as the recorder drives it."""
 
-    tick_hz, wrap_bits: unit of its `device_ticks` (wrap_bits 0: does not wrap).
-    """
+    @property
+    def tick_hz(self) -> float:
+        """Unit of its `device_ticks`."""
 
-    tick_hz: float
-    wrap_bits: int
-    streams: tuple[StreamSpec, ...]
+    @property
+    def wrap_bits(self) -> int:
+        """Width of the device's time counter; 0: does not wrap."""
+
+    @property
+    def streams(self) -> tuple[StreamSpec, ...]:
+        """What it sends, with the rates to expect."""
 
     @property
     def identity(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ NS_PER_S = 1_000_000_000
 BYTES_PER_PIXEL = 0.25  # generous for H.264 at visually lossless quality; only the disk check uses it
 
 
-class StreamConfig(DeviceConfig):
+class StreamConfig(DeviceConfig, frozen=True, kw_only=True):
     """Keys of a stream camera.
 
     url: anything FFmpeg opens (tcp://, rtsp://, http://, a device or file); format: its FFmpeg name where it must be
@@ -134,7 +134,7 @@ class StreamDriver:
             device_ticks = int(packet.pts * time_base * NS_PER_S)
             yield self._picture(packet, device_ticks, arrival_ns)
 
-    def _picture(self, packet: Packet, device_ticks: int, arrival_ns: int) -> Received:
+    def _picture(self, packet: "Packet[VideoStream]", device_ticks: int, arrival_ns: int) -> Received:
         lost = self._pictures_lost_before(device_ticks)
         events = (DeviceEvent("gap", f"{lost} pictures lost before this one", lost),) if lost else ()
         inter_coded = self._format.codec in INTER_CODED
