@@ -1,0 +1,175 @@
+"""recording.json and events.jsonl: what a recording is, how it was made, and what happened meanwhile."""
+
+import hashlib
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+MANIFEST_NAME = "recording.json"
+EVENTS_NAME = "events.jsonl"
+NS_PER_S = 1_000_000_000
+
+
+class StreamSummary(msgspec.Struct, omit_defaults=False):
+    """Counts of one stream of one device.
+
+    received: samples decoded; written: in the recording; lost: missed by the link, by the device's own numbering;
+    dropped: received and not recorded for want of room or because a picture before was lost; late: written out of
+    order first and merged at the end; before_start: sampled before the take's time 0; incomplete: samples that
+    lack what the format needs (a fix without altitude); rate_hz: expected, null where unknown.
+    """
+
+    kind: str
+    rate_hz: float | None = None
+    received: int = 0
+    written: int = 0
+    lost: int = 0
+    dropped: int = 0
+    late: int = 0
+    before_start: int = 0
+    incomplete: int = 0
+
+
+class DeviceSummary(msgspec.Struct):
+    """One device of the rig: its driver, what it said of itself, its clock, and its stream's counts."""
+
+    driver: str
+    clock: str
+    latency_s: float
+    identity: dict[str, str]
+    stream: StreamSummary
+
+
+class ClockSummary(msgspec.Struct):
+    """One device clock as the clock map saw it at the end."""
+
+    tick_hz: float
+    wrap_bits: int
+    epochs: int
+    skew_ppm: float | None
+    uncertainty_us: float | None
+    duplicates: int
+    resets: int
+    wraps: int
+
+
+class UtcAtZero(msgspec.Struct):
+    """UTC at recording time 0, in nanoseconds since 1970, and how it is known."""
+
+    utc_ns: int
+    source: str
+
+
+class FileEntry(msgspec.Struct):
+    """Size and SHA-256 of one file of a finished recording."""
+
+    size: int
+    sha256: str
+
+
+class Manifest(msgspec.Struct, kw_only=True):
+    """recording.json.
+
+    state: recording while the take runs; complete after an orderly end; recovered after repair.
+    stopped_by: why the take ended (duration, interrupt, disk low, an error's text); null while it runs.
+    start_monotonic_ns: the host's monotonic clock at recording time 0 (times in raw/ are on that clock).
+    cameras: device names in the order of cameraInd.
+    """
+
+    format: str = "rigtape-1"
+    state: Literal["recording", "complete", "recovered"]
+    name: str
+    started_utc: str
+    start_monotonic_ns: int
+    utc_at_time_0: UtcAtZero
+    duration_s: float | None = None
+    stopped_by: str | None = None
+    cameras: list[str]
+    devices: dict[str, DeviceSummary]
+    clocks: dict[str, ClockSummary]
+    rig: dict[str, Any]
+    versions: dict[str, str]
+    host: dict[str, str]
+    files: dict[str, FileEntry] = {}
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write recording.json whole or not at all (temporary file, fsync, rename)."""
+    write_atomically(folder / MANIFEST_NAME, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """recording.json of a folder. Raises OSError, msgspec.DecodeError or msgspec.ValidationError."""
+    return msgspec.json.decode((folder / MANIFEST_NAME).read_bytes(), type=Manifest)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a small file so that a reader sees the old one or the new one, also after power loss."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames and creations in a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def file_entries(folder: Path) -> dict[str, FileEntry]:
+    """Size and SHA-256 of all files of a recording but the manifest itself, by relative path."""
+    entries = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != MANIFEST_NAME:
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            entries[path.relative_to(folder).as_posix()] = FileEntry(path.stat().st_size, digest)
+    return entries
+
+
+class EventLog:
+    """events.jsonl: one line per event, on disk at once; may be called from any thread.
+
+    time_s is recording time; what happened before the start has a negative one.
+    """
+
+    def __init__(
+        self, path: Path, start_monotonic_ns: int, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        """Create the file; it must not exist."""
+        self._file = path.open("xb", buffering=0)
+        self._start_ns = start_monotonic_ns
+        self._monotonic_ns = monotonic_ns
+        self._lock = threading.Lock()
+
+    def write(self, device: str, kind: str, text: str, count: int = 0) -> None:
+        """Append one event."""
+        event: dict[str, object] = {
+            "time": (self._monotonic_ns() - self._start_ns) / NS_PER_S,
+            "device": device,
+            "kind": kind,
+            "text": text,
+        }
+        if count:
+            event["count"] = count
+        with self._lock:
+            if not self._file.closed:
+                self._file.write(msgspec.json.encode(event) + b"\n")
+
+    def close(self) -> None:
+        """Close the file, durably."""
+        with self._lock:
+            os.fsync(self._file.fileno())
+            self._file.close()
