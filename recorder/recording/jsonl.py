@@ -1,0 +1,310 @@
+"""data.jsonl: the lines of the Spectacular AI data format, each written when what it names is on disk.
+
+Lines are handed over in time order and written in that order; a line whose picture or file is not on disk yet holds
+back those after it. A line that came late goes to late.jsonl beside it and is merged in when the recording closes, so
+data.jsonl ascends at all times. SIGKILL costs at most the last FLUSH_S, power loss at most SYNC_S more.
+
+Key names are those of the data format; extra keys, which its readers ignore: `fix` beside `gps`, and the counts
+within `lidar`.
+"""
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BufferedWriter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from drivers.samples import FixSample, ImuSample, PoseSample, ScanSample
+from recorder.recording.manifest import NS_PER_S, sync_folder
+from recorder.recording.work import ByteQueue, Ticket, start_thread
+
+DATA_NAME = "data.jsonl"
+LATE_NAME = "late.jsonl"
+FLUSH_S = 0.1
+SYNC_S = 1.0
+QUEUE_BYTES = 64 << 20
+LINE_BYTES = 300
+
+encode_json = msgspec.json.Encoder().encode
+
+
+class SensorValues(msgspec.Struct):
+    """Body of a sensor line."""
+
+    type: str
+    values: tuple[float, ...]
+
+
+class SensorLine(msgspec.Struct):
+    """One reading of one sensor: m/s², rad/s, µT or K."""
+
+    sensor: SensorValues
+    time: float
+
+
+class FrameEntry(msgspec.Struct, omit_defaults=True):
+    """One camera's picture within a frames line."""
+
+    cameraInd: int  # noqa: N815 - key of the format
+    time: float
+    exposureTimeSeconds: float | None = None  # noqa: N815
+    missingBitmap: bool = False  # noqa: N815
+
+
+class FramesLine(msgspec.Struct):
+    """One frame set: an entry for every camera."""
+
+    frames: list[FrameEntry]
+    number: int
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
+class PendingPicture:
+    """A camera's place in a frame set: its ticket, or None when there is no picture."""
+
+    ticket: Ticket | None
+    exposure_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PendingFrames:
+    """A frames line to be: it is numbered and written when all its pictures are in their files (or failed)."""
+
+    time_ns: int
+    pictures: tuple[PendingPicture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PendingScan:
+    """A lidar line to be, written when its file is whole."""
+
+    ticket: Ticket
+    line: bytes
+
+
+Pending = bytes | PendingFrames | PendingScan
+
+
+def imu_lines(time_ns: int, sample: ImuSample) -> list[bytes]:
+    """One line per sensor of an IMU sample, accelerometer first."""
+    time_s = time_ns / NS_PER_S
+    sensors = (
+        ("accelerometer", sample.accel_m_s2),
+        ("gyroscope", sample.gyro_rad_s),
+        ("magnetometer", sample.mag_ut),
+        ("imuTemperature", None if sample.temperature_k is None else (sample.temperature_k,)),
+    )
+    return [
+        encode_json(SensorLine(SensorValues(kind, values), time_s)) for kind, values in sensors if values is not None
+    ]
+
+
+def fix_line(time_ns: int, fix: FixSample) -> bytes | None:
+    """A gps line; None when the fix lacks what the format needs (altitude, accuracies)."""
+    if fix.altitude_m is None or fix.accuracy_m is None or fix.vertical_accuracy_m is None:
+        return None
+    gps = {
+        "latitude": fix.latitude_deg,
+        "longitude": fix.longitude_deg,
+        "altitude": fix.altitude_m,
+        "accuracy": fix.accuracy_m,
+        "verticalAccuracy": fix.vertical_accuracy_m,
+    }
+    details = {
+        "quality": fix.quality,
+        "satellites": fix.satellites,
+        "hdop": fix.hdop,
+        "undulation": fix.undulation_m,
+        "correctionAge": fix.correction_age_s,
+        "accuracySource": fix.accuracy_source,
+        "utc": fix.device_ticks / NS_PER_S,
+    }
+    known = {key: value for key, value in details.items() if value is not None}
+    return encode_json({"gps": gps, "fix": known, "time": time_ns / NS_PER_S})
+
+
+def pose_line(time_ns: int, name: str, pose: PoseSample) -> bytes:
+    """A groundTruth line, or one of a named method."""
+    body: dict[str, object] = {"position": dict(zip("xyz", pose.position_m, strict=True))}
+    if pose.orientation_wxyz is not None:
+        body["orientation"] = dict(zip("wxyz", pose.orientation_wxyz, strict=True))
+    return encode_json({name: body, "time": time_ns / NS_PER_S})
+
+
+def lidar_line(time_ns: int, model: str, data_file: str, scan: ScanSample) -> bytes:
+    """A lidar line; time is that of the scan's last point."""
+    lidar: dict[str, object] = {
+        "model": model,
+        "dataFile": data_file,
+        "points": len(scan.points),
+        "packetsExpected": scan.packets_expected,
+        "packetsReceived": scan.packets_received,
+    }
+    if scan.is_partial:
+        lidar["partial"] = True
+    return encode_json({"lidar": lidar, "time": time_ns / NS_PER_S})
+
+
+class LineWriter:
+    """Writes data.jsonl in a thread of its own."""
+
+    def __init__(self, folder: Path, on_error: Callable[[str, Exception], None]) -> None:
+        """Create data.jsonl; it must not exist."""
+        self.written_lines = 0
+        self.frames_written = 0
+        self._folder = folder
+        self._file = (folder / DATA_NAME).open("xb")
+        self._late_file: BufferedWriter | None = None
+        self._queue: ByteQueue[tuple[Pending, bool]] = ByteQueue(QUEUE_BYTES)
+        self._on_error = on_error
+        self._thread = start_thread("jsonl", self._run, self._failed)
+
+    def put(self, line: Pending, *, late: bool = False) -> None:
+        """Take the next line; waits when the disk is far behind."""
+        self._queue.put((line, late), len(line) if isinstance(line, bytes) else LINE_BYTES)
+
+    def _run(self) -> None:
+        waiting: deque[tuple[Pending, bool]] = deque()
+        last_sync_s = time.monotonic()
+        while waiting or not self._queue.ended:
+            waiting.extend(self._queue.get_all(FLUSH_S))
+            self._write_ready(waiting)
+            self._file.flush()
+            if time.monotonic() - last_sync_s >= SYNC_S:
+                os.fdatasync(self._file.fileno())
+                last_sync_s = time.monotonic()
+            time.sleep(FLUSH_S / 2)  # collects lines: one write for many
+
+    def _write_ready(self, waiting: deque[tuple[Pending, bool]]) -> None:
+        while waiting:
+            pending, late = waiting[0]
+            if not _is_ready(pending):
+                return
+            waiting.popleft()
+            line = self._finished(pending)
+            if line is None:
+                continue
+            (self._open_late_file() if late else self._file).write(line + b"\n")
+            self.written_lines += 1
+
+    def _finished(self, pending: Pending) -> bytes | None:
+        if isinstance(pending, bytes):
+            return pending
+        if isinstance(pending, PendingScan):
+            return pending.line if pending.ticket.state == "done" else None
+        time_s = pending.time_ns / NS_PER_S
+        entries = [
+            FrameEntry(index, time_s, picture.exposure_s, picture.ticket is None or picture.ticket.state == "failed")
+            for index, picture in enumerate(pending.pictures)
+        ]
+        if all(entry.missingBitmap for entry in entries):
+            return None
+        line = encode_json(FramesLine(entries, self.frames_written, time_s))
+        self.frames_written += 1
+        return line
+
+    def _failed(self, name: str, error: Exception) -> None:
+        """Nothing can be written any more: empty the queue, so that nobody waits for room."""
+        self._on_error(name, error)
+        while not self._queue.ended:
+            self._queue.get_all(FLUSH_S)
+
+    def _open_late_file(self) -> BufferedWriter:
+        if self._late_file is None:
+            self._late_file = (self._folder / LATE_NAME).open("xb")
+        return self._late_file
+
+    def close(self) -> None:
+        """Write what is left, merge late lines in, make all of it durable."""
+        self._queue.close()
+        self._thread.join()
+        for file in (self._late_file, self._file):
+            if file is not None:
+                file.flush()
+                os.fsync(file.fileno())
+                file.close()
+        if self._late_file is not None:
+            merge_late_lines(self._folder)
+
+
+def _is_ready(pending: Pending) -> bool:
+    if isinstance(pending, PendingFrames):
+        return all(picture.ticket is None or picture.ticket.state != "pending" for picture in pending.pictures)
+    return not isinstance(pending, PendingScan) or pending.ticket.state != "pending"
+
+
+def merge_late_lines(folder: Path) -> None:
+    """Merge late.jsonl into data.jsonl by time; a late picture joins the line of its instant; frames are renumbered.
+
+    Memory holds the late lines only. data.jsonl is replaced whole, then late.jsonl removed.
+    """
+    late_path, data_path = folder / LATE_NAME, folder / DATA_NAME
+    late = sorted(_decoded_lines(late_path), key=lambda entry: entry[0])
+    merged_path = folder / (DATA_NAME + ".tmp")
+    with merged_path.open("wb") as merged:
+        number = 0
+        for line in _joined(_merged(_decoded_lines(data_path), iter(late))):
+            if "frames" in line:
+                line["number"] = number
+                number += 1
+            merged.write(encode_json(line) + b"\n")
+        merged.flush()
+        os.fsync(merged.fileno())
+    merged_path.replace(data_path)
+    late_path.unlink()
+    sync_folder(folder)
+
+
+def _decoded_lines(path: Path) -> Iterator[tuple[float, dict[str, Any]]]:
+    with path.open("rb") as file:
+        for text in file:
+            line = msgspec.json.decode(text, type=dict[str, Any])
+            yield float(line["time"]), line
+
+
+def _merged(
+    lines: Iterator[tuple[float, dict[str, Any]]], late: Iterator[tuple[float, dict[str, Any]]]
+) -> Iterator[dict[str, Any]]:
+    next_late = next(late, None)
+    for time_s, line in lines:
+        while next_late is not None and next_late[0] < time_s:
+            yield next_late[1]
+            next_late = next(late, None)
+        yield line
+    while next_late is not None:
+        yield next_late[1]
+        next_late = next(late, None)
+
+
+def _joined(lines: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Join frames lines of one instant: cameras whose pictures came apart belong to one set."""
+    held: list[dict[str, Any]] = []  # lines of one time that hold a frames line
+    for line in lines:
+        if held and line["time"] != held[0]["time"]:
+            yield from held
+            held = []
+        partner = next((other for other in held if "frames" in other), None)
+        if partner is not None and "frames" in line and _fill_missing(partner["frames"], line["frames"]):
+            continue
+        if held or "frames" in line:
+            held.append(line)
+        else:
+            yield line
+    yield from held
+
+
+def _fill_missing(entries: list[dict[str, Any]], late_entries: list[dict[str, Any]]) -> bool:
+    """Move the pictures of a late set into the gaps of the first; False when one of them has no gap there."""
+    pairs = [(old, new) for old, new in zip(entries, late_entries, strict=True) if not new.get("missingBitmap")]
+    if not all(old.get("missingBitmap") for old, _ in pairs):
+        return False
+    for old, new in pairs:
+        old.clear()
+        old.update(new)
+    return True

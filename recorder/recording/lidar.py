@@ -1,0 +1,75 @@
+"""lidar/000000.bin ...: one file of packed points per scan, there whole or not at all.
+
+A file is written under a temporary name, made durable and renamed; only then its ticket is done and its line may be
+written.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from recorder.recording.manifest import sync_folder
+from recorder.recording.work import ByteQueue, Ticket, start_thread
+
+FOLDER = "lidar"
+QUEUE_BYTES = 128 << 20
+SYNC_SCANS = 10
+
+
+def scan_name(index: int) -> str:
+    """Path of a scan relative to the recording."""
+    return f"{FOLDER}/{index:06d}.bin"
+
+
+class ScanWriter:
+    """Writes scans in a thread of its own."""
+
+    def __init__(self, folder: Path, on_error: Callable[[str, Exception], None]) -> None:
+        """Create the folder lidar/; it must not exist."""
+        self._folder = folder
+        (folder / FOLDER).mkdir()
+        self._count = 0
+        self._on_error = on_error
+        self._queue: ByteQueue[tuple[str, npt.NDArray[np.void], Ticket]] = ByteQueue(QUEUE_BYTES)
+        self._thread = start_thread("lidar", self._run, self._failed)
+
+    def put(self, points: npt.NDArray[np.void]) -> tuple[str, Ticket]:
+        """Take a scan; gives its path relative to the recording. Waits when the disk is far behind."""
+        name = scan_name(self._count)
+        self._count += 1
+        ticket = Ticket()
+        self._queue.put((name, points, ticket), points.nbytes)
+        return name, ticket
+
+    def _run(self) -> None:
+        written = 0
+        while not self._queue.ended:
+            for name, points, ticket in self._queue.get_all(0.5):
+                self._write(self._folder / name, points)
+                ticket.state = "done"
+                written += 1
+                if written % SYNC_SCANS == 0:
+                    sync_folder(self._folder / FOLDER)
+
+    def _write(self, path: Path, points: npt.NDArray[np.void]) -> None:
+        temporary = path.with_suffix(".tmp")
+        with temporary.open("xb") as file:
+            file.write(points.data)
+            file.flush()
+            os.fdatasync(file.fileno())
+        temporary.rename(path)
+
+    def _failed(self, name: str, error: Exception) -> None:
+        self._on_error(name, error)
+        while not self._queue.ended:
+            for _, _, ticket in self._queue.get_all(0.5):
+                ticket.state = "failed"
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._queue.close()
+        self._thread.join()
+        sync_folder(self._folder / FOLDER)

@@ -1,0 +1,186 @@
+"""raw/: what came over the wire, with its arrival, so that everything can be decoded and stamped again.
+
+raw/DEVICE.pcapng holds the bytes of a wire device with nanosecond time stamps and opens in Wireshark: datagrams as
+IPv4/UDP packets, serial chunks under a user link type (LINKTYPE_USER0; bytes we sent are marked outbound). Time stamps
+are UTC: the arrival on the host's monotonic clock plus a constant, `utc_at_time_0.utc_ns - start_monotonic_ns` of
+recording.json. Format: the pcapng Internet-Draft (draft-ietf-opsawg-pcapng), sections 4.1 to 4.3.
+
+raw/DEVICE.clock holds the pairs that the clock map was fed: little-endian int64 (device ticks, arrival in monotonic
+ns), 16 bytes a pair.
+"""
+
+import os
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.samples import Chunk
+from recorder.recording.work import ByteQueue, start_thread
+
+FOLDER = "raw"
+QUEUE_BYTES = 64 << 20
+FLUSH_S = 0.5
+SYNC_S = 1.0
+LINKTYPE_RAW_IP = 101
+LINKTYPE_USER0 = 147
+MAX_SERIAL_PACKET = 65535
+_UINT32 = struct.Struct("<I")
+_BLOCK_HEAD = struct.Struct("<IIIIIII")  # type, length, interface, time high, time low, captured, original
+_IP_UDP = struct.Struct(">BBHHHBBH4s4sHHHH")
+_OPTION_OUTBOUND = struct.pack("<HHI", 2, 4, 2) + struct.pack("<HH", 0, 0)  # epb_flags: outbound; end of options
+
+
+class TapeFile:
+    """One pcapng file of one wire device."""
+
+    def __init__(self, path: Path, *, is_serial: bool, utc_minus_monotonic_ns: int) -> None:
+        """Create the file with its section and interface headers; it must not exist."""
+        self.file = path.open("xb", buffering=1 << 20)
+        self._is_serial = is_serial
+        self._offset_ns = utc_minus_monotonic_ns
+        self._ip_headers: dict[tuple[object, ...], bytes] = {}
+        self.file.write(_section_header() + _interface(LINKTYPE_USER0 if is_serial else LINKTYPE_RAW_IP))
+
+    def write(self, chunk: Chunk) -> None:
+        """Append one chunk as an enhanced packet block."""
+        if self._is_serial:
+            for start in range(0, len(chunk.data), MAX_SERIAL_PACKET):
+                self._write_packet(chunk, b"", chunk.data[start : start + MAX_SERIAL_PACKET])
+        else:
+            self._write_packet(chunk, self._ip_header(chunk), chunk.data)
+
+    def _write_packet(self, chunk: Chunk, header: bytes, payload: bytes) -> None:
+        stamp_ns = chunk.arrival_ns + self._offset_ns
+        size = len(header) + len(payload)
+        padding = b"\0" * (-size % 4)
+        options = _OPTION_OUTBOUND if chunk.sent else b""
+        length = _BLOCK_HEAD.size + size + len(padding) + len(options) + 4
+        head = _BLOCK_HEAD.pack(6, length, 0, stamp_ns >> 32, stamp_ns & 0xFFFFFFFF, size, size)
+        self.file.write(b"".join((head, header, payload, padding, options, _UINT32.pack(length))))
+
+    def _ip_header(self, chunk: Chunk) -> bytes:
+        """IPv4 and UDP headers; those of one device differ only with the datagram's length."""
+        key = (len(chunk.data), chunk.source, chunk.destination)
+        header = self._ip_headers.get(key)
+        if header is None:
+            header = _ip_udp_header(chunk)
+            if len(self._ip_headers) < 4096:
+                self._ip_headers[key] = header
+        return header
+
+
+def _section_header() -> bytes:
+    return struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+
+
+def _interface(link_type: int) -> bytes:
+    nanoseconds = struct.pack("<HHB3x", 9, 1, 9) + struct.pack("<HH", 0, 0)  # if_tsresol 10^-9; end of options
+    length = 16 + len(nanoseconds) + 4
+    return struct.pack("<IIHHI", 1, length, link_type, 0, 0) + nanoseconds + _UINT32.pack(length)
+
+
+def _ip_udp_header(chunk: Chunk) -> bytes:
+    source, source_port = chunk.source or ("0.0.0.0", 0)
+    destination, destination_port = chunk.destination or ("0.0.0.0", 0)
+    udp_length = 8 + len(chunk.data)
+    fields = [
+        0x45, 0, min(20 + udp_length, 0xFFFF), 0, 0, 64, 17, 0, _packed_address(source), _packed_address(destination),
+        source_port, destination_port, min(udp_length, 0xFFFF), 0,
+    ]  # fmt: skip
+    words = struct.unpack(">10H", _IP_UDP.pack(*fields)[:20])
+    total = sum(words)
+    total = (total & 0xFFFF) + (total >> 16)
+    fields[7] = ~((total & 0xFFFF) + (total >> 16)) & 0xFFFF
+    return _IP_UDP.pack(*fields)
+
+
+def _packed_address(address: str) -> bytes:
+    return bytes(int(part) for part in address.split("."))
+
+
+class RawWriter:
+    """Writes tapes and clock pairs of all devices in one thread; a full queue drops and counts.
+
+    dropped_bytes: wire bytes that the tape lost for want of room, by device.
+    """
+
+    def __init__(
+        self, folder: Path, utc_minus_monotonic_ns: int, on_error: Callable[[str, Exception], None], *, tape: bool
+    ) -> None:
+        """Create the folder raw/; tape False: clock pairs only."""
+        self.dropped_bytes: dict[str, int] = {}
+        self._folder = folder / FOLDER
+        self._folder.mkdir()
+        self._offset_ns = utc_minus_monotonic_ns
+        self._tape = tape
+        self._tapes: dict[str, TapeFile] = {}
+        self._pair_files: dict[str, BinaryIO] = {}
+        self._queue: ByteQueue[tuple[str, tuple[Chunk, ...] | bytes]] = ByteQueue(QUEUE_BYTES)
+        self._on_error = on_error
+        self._thread = start_thread("raw", self._run, self._failed)
+
+    def put_chunks(self, device: str, chunks: tuple[Chunk, ...]) -> None:
+        """Take what one read brought; never waits."""
+        if not self._tape or not chunks:
+            return
+        size = sum(len(chunk.data) + 64 for chunk in chunks)
+        if not self._queue.offer((device, chunks), size):
+            self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + size
+
+    def put_pairs(self, device: str, pairs: npt.NDArray[np.int64]) -> None:
+        """Take (n, 2) int64 (ticks, arrival_ns)."""
+        data = pairs.astype("<i8").tobytes()
+        if not self._queue.offer((device, data), len(data)):
+            self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + len(data)
+
+    def _run(self) -> None:
+        last_sync_s = time.monotonic()
+        while not self._queue.ended:
+            for device, item in self._queue.get_all(FLUSH_S):
+                if isinstance(item, bytes):
+                    self._pair_file(device).write(item)
+                else:
+                    tape = self._tape_file(device, item[0])
+                    for chunk in item:
+                        tape.write(chunk)
+            for file in self._files():
+                file.flush()
+            if time.monotonic() - last_sync_s >= SYNC_S:
+                for file in self._files():
+                    os.fdatasync(file.fileno())
+                last_sync_s = time.monotonic()
+            time.sleep(0.02)  # collects chunks: few large writes
+
+    def _files(self) -> list[BinaryIO]:
+        return [tape.file for tape in self._tapes.values()] + list(self._pair_files.values())
+
+    def _tape_file(self, device: str, first: Chunk) -> TapeFile:
+        if device not in self._tapes:
+            path = self._folder / f"{device}.pcapng"
+            is_serial = first.destination is None
+            self._tapes[device] = TapeFile(path, is_serial=is_serial, utc_minus_monotonic_ns=self._offset_ns)
+        return self._tapes[device]
+
+    def _pair_file(self, device: str) -> BinaryIO:
+        if device not in self._pair_files:
+            self._pair_files[device] = (self._folder / f"{device}.clock").open("xb", buffering=1 << 16)
+        return self._pair_files[device]
+
+    def _failed(self, name: str, error: Exception) -> None:
+        self._on_error(name, error)
+        while not self._queue.ended:
+            self._queue.get_all(0.5)
+
+    def close(self) -> None:
+        """Write what is left, durably."""
+        self._queue.close()
+        self._thread.join()
+        for file in self._files():
+            file.flush()
+            os.fsync(file.fileno())
+            file.close()

@@ -1,0 +1,99 @@
+"""What the writers of a recording share: a bounded queue with a thread behind it, and tickets for work done.
+
+A line of data.jsonl that names a picture or a file may be written only when that is on disk; the writer of the
+picture or file says so through the line's ticket.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Ticket:
+    """State of one piece of work on disk: pending, then done or failed. Set by one thread, read by another."""
+
+    __slots__ = ("state",)
+
+    def __init__(self) -> None:
+        """Pending."""
+        self.state = "pending"
+
+
+class ByteQueue(Generic[T]):
+    """A queue bounded by bytes, for one consumer thread.
+
+    limit_bytes: at most so much waits (one item may be larger). `offer` drops when full, `put` waits for room.
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        """Empty and open."""
+        self._limit = limit_bytes
+        self._items: deque[tuple[T, int]] = deque()
+        self._bytes = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """How much waits now."""
+        return self._bytes
+
+    def offer(self, item: T, size: int) -> bool:
+        """Take the item if there is room; False when there is not."""
+        with self._changed:
+            if self._items and self._bytes + size > self._limit:
+                return False
+            self._append(item, size)
+            return True
+
+    def put(self, item: T, size: int) -> None:
+        """Take the item, waiting for room; after `close` nothing waits any more."""
+        with self._changed:
+            while self._items and self._bytes + size > self._limit and not self._closed:
+                self._changed.wait()
+            self._append(item, size)
+
+    def _append(self, item: T, size: int) -> None:
+        self._items.append((item, size))
+        self._bytes += size
+        self._changed.notify_all()
+
+    def get_all(self, timeout_s: float) -> list[T]:
+        """All that waits; empty after `timeout_s` without any."""
+        with self._changed:
+            if not self._items and not self._closed:
+                self._changed.wait(timeout_s)
+            items = [item for item, _ in self._items]
+            self._items.clear()
+            self._bytes = 0
+            self._changed.notify_all()
+            return items
+
+    def close(self) -> None:
+        """No more is coming: the consumer ends when the queue is empty."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def ended(self) -> bool:
+        """Closed and empty."""
+        with self._changed:
+            return self._closed and not self._items
+
+
+def start_thread(name: str, body: Callable[[], None], on_error: Callable[[str, Exception], None]) -> threading.Thread:
+    """Run `body` in a thread of that name; an exception that leaves it is handed to `on_error`."""
+
+    def guarded() -> None:
+        try:
+            body()
+        except Exception as error:  # the top of a thread: whatever it is, the take must end loudly
+            on_error(name, error)
+
+    thread = threading.Thread(target=guarded, name=name, daemon=True)
+    thread.start()
+    return thread

@@ -1,0 +1,101 @@
+"""Pairs the pictures of synchronised cameras and merges all streams into time order: pure, no clock, no thread.
+
+Items wait until the watermark has passed their time; the caller moves it (usually: now minus a fixed window). What
+comes after the watermark passed its time is given out at once and marked late.
+"""
+
+import heapq
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+P = TypeVar("P")
+REMEMBERED_SETS = 256
+
+
+@dataclass(slots=True)
+class FrameSet(Generic[P]):
+    """The pictures that cameras of one clock took at one instant; None where a camera's picture is not there.
+
+    device_ns: instant on the cameras' clock. pictures: by camera index.
+    """
+
+    device_ns: int
+    pictures: list[P | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Released(Generic[T, P]):
+    """One item in its turn. late: items of a later time were given out before."""
+
+    time_ns: int
+    item: "T | FrameSet[P]"
+    late: bool
+
+
+@dataclass(slots=True)
+class Synchronizer(Generic[T, P]):
+    """T: items of all streams but pictures; P: pictures.
+
+    cameras: how many cameras make a frame set. pair_within_ns: pictures of one set differ less than this in
+    device time (half a frame period).
+    """
+
+    cameras: int
+    pair_within_ns: int
+    _heap: list[tuple[int, int, "T | FrameSet[P]"]] = field(default_factory=list)
+    _sequence: int = 0
+    _watermark_ns: int | None = None
+    _open_sets: deque[tuple[int, FrameSet[P]]] = field(default_factory=deque)
+    _given_out: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SETS))
+
+    def add(self, time_ns: int, item: T) -> None:
+        """Take an item of any stream but cameras."""
+        self._push(time_ns, item)
+
+    def add_picture(self, camera: int, device_ns: int, time_ns: int, picture: P | None) -> None:
+        """Take a camera's picture (None: it was taken and is lost) and pair it by device time."""
+        for _, frame_set in reversed(self._open_sets):
+            if abs(frame_set.device_ns - device_ns) < self.pair_within_ns:
+                if frame_set.pictures[camera] is None:
+                    frame_set.pictures[camera] = picture
+                    return
+                break  # a second picture of one camera within half a period: kept as a set of its own
+        frame_set = FrameSet(device_ns, [None] * self.cameras)
+        frame_set.pictures[camera] = picture
+        for given_device_ns, given_time_ns in reversed(self._given_out):
+            if abs(given_device_ns - device_ns) < self.pair_within_ns:
+                time_ns = given_time_ns  # its partner went out without it: same instant, same time
+                break
+        self._open_sets.append((time_ns, frame_set))
+        self._push(time_ns, frame_set)
+
+    def _push(self, time_ns: int, item: "T | FrameSet[P]") -> None:
+        heapq.heappush(self._heap, (time_ns, self._sequence, item))
+        self._sequence += 1
+
+    def release(self, watermark_ns: int) -> list[Released[T, P]]:
+        """All items up to the watermark, in time order; a set that is incomplete by then goes out as it is."""
+        released: list[Released[T, P]] = []
+        while self._heap and self._heap[0][0] <= watermark_ns:
+            time_ns, _, item = heapq.heappop(self._heap)
+            late = self._watermark_ns is not None and time_ns <= self._watermark_ns
+            if isinstance(item, FrameSet):
+                self._close_set(time_ns, item)
+            released.append(Released(time_ns, item, late))
+        if self._watermark_ns is None or watermark_ns > self._watermark_ns:
+            self._watermark_ns = watermark_ns
+        return released
+
+    def _close_set(self, time_ns: int, closed: FrameSet[P]) -> None:
+        self._open_sets = deque(entry for entry in self._open_sets if entry[1] is not closed)
+        self._given_out.append((closed.device_ns, time_ns))
+
+    def flush(self) -> list[Released[T, P]]:
+        """All that is left, in time order: the end of a take."""
+        return self.release(max((time_ns for time_ns, _, _ in self._heap), default=0))
+
+    def __len__(self) -> int:
+        """How many items wait."""
+        return len(self._heap)
