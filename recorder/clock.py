@@ -1,0 +1,426 @@
+"""From device time to host time: one `ClockMap` per device clock, fed with (ticks, arrival) pairs.
+
+    ticks ──▶ ClockStream ──▶ device time, int ns ──▶ Estimator ──▶ host time, int ns
+              one per stream: unit, wrap,             one per clock: buckets, line
+              duplicates, order, restarts             under the arrivals, sync epochs
+
+A stamp is never later than its arrival; within a sync epoch stamps never decrease and the line never steps: it is
+slewed.  A restart or pause of the device and a suspend of the host begin a new epoch: `epoch` counts up, the device
+axis is shifted so that it runs on, the skew is kept and the level learnt again.  The least delay of the link cannot be
+told from arrivals; stamps are late by this constant.
+
+Pure: no clock, no thread, no I/O.  Calls on one map and its streams must not overlap, but `refit` may run in another
+thread than the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorder.clock_estimator import LATE_NS, PERSISTS_NS, Estimator, Ints, S
+from recorder.clock_fit import PPM, SlopePrior
+from recorder.clock_refine import refine_epoch
+
+FAR = 1 << 61  # ticks and device times beyond this are garbage
+STEP_BACK_NS = 1 * S  # less is reordering
+SUSPECTS = 3  # this many consistent samples prove a restart
+MIN_BATCH = 12  # smaller ones are not worth numpy
+NEVER_NS = -(1 << 63)
+
+
+class ClockStream:
+    """One stream of a device clock: its tick unit, its unwrapping, its order.
+
+    tick_hz: ticks per second of the stream's counter; wrap_bits: its width, 0 if it does not wrap.
+    """
+
+    def __init__(self, estimator: Estimator, tick_hz: float, wrap_bits: int = 0):
+        if not (tick_hz > 0 and math.isfinite(tick_hz)):
+            raise ValueError(f"tick_hz must be a positive number, not {tick_hz}")
+        if wrap_bits < 0:
+            raise ValueError(f"wrap_bits must not be negative, not {wrap_bits}")
+        ns_per_tick = S / Fraction(tick_hz).limit_denominator(1_000_000)
+        self._estimator = estimator
+        self._num, self._den = ns_per_tick.numerator, ns_per_tick.denominator
+        self._modulus = 1 << wrap_bits if wrap_bits else 0
+        self._wrap_ns = self._ns(self._modulus)
+        self._late_ns = min(LATE_NS, self._wrap_ns // 4) if wrap_bits else LATE_NS
+        self._own_zero_ns = 0  # a stream whose counter starts elsewhere than the first stream's
+        self._epoch = -1  # of the last sample
+        self._ticks = 0  # of the last sample, unwrapped
+        self._device_ns = 0
+        self._arrival_ns = 0
+        self._stamp_ns = NEVER_NS
+        self._suspects: list[tuple[int, int]] = []
+        self._late_since: tuple[int, float] | None = None
+
+    def map(self, ticks: int, arrival_ns: int) -> int:
+        """Host time of one event: learn from it, then answer."""
+        device_ns = self.observe(ticks, arrival_ns)
+        stamp_ns = max(self._estimator.host_ns(device_ns), self._stamp_ns)
+        self._stamp_ns = min(stamp_ns, arrival_ns)
+        return self._stamp_ns
+
+    def observe(self, ticks: int, arrival_ns: int) -> int:
+        """Learn from one sample; its device time on the map's axis, int ns."""
+        estimator = self._estimator
+        step = ticks - self._ticks
+        if self._modulus:
+            step %= self._modulus
+        unwrapped = self._ticks + step
+        device_ns = unwrapped * self._num // self._den + self._own_zero_ns + estimator.zero_ns
+        if self._epoch != estimator.epoch or step <= 0 or not -FAR < device_ns < FAR:
+            return self._observe_unsure(int(ticks), int(arrival_ns))
+        x = device_ns - estimator.anchor_device
+        y = arrival_ns - estimator.anchor_host - x
+        rest = y - estimator.fit.offset - estimator.fit.slope * x
+        if not -estimator.early_ns < rest < self._late_ns or self._suspects or self._late_since:
+            return self._observe_unsure(int(ticks), int(arrival_ns))
+        if self._modulus and unwrapped // self._modulus != self._ticks // self._modulus:
+            estimator.counts.wraps += 1
+        self._ticks, self._device_ns, self._arrival_ns = unwrapped, device_ns, arrival_ns
+        estimator.feed(x, y, rest)
+        return device_ns if self._epoch == estimator.epoch else self._remember(unwrapped, arrival_ns)
+
+    def observe_many(self, ticks: Ints, arrival_ns: Ints) -> Ints:
+        """`observe` for a batch in order of arrival."""
+        if ticks.size >= MIN_BATCH and self._epoch == self._estimator.epoch:
+            device_ns = self._observe_plain(ticks, arrival_ns)
+            if device_ns is not None:
+                return device_ns
+        pairs = zip(ticks.tolist(), arrival_ns.tolist(), strict=True)
+        return np.array([self.observe(tick, arrival) for tick, arrival in pairs], dtype=np.int64)
+
+    def _observe_plain(self, ticks: Ints, arrival_ns: Ints) -> Ints | None:
+        """The whole batch at once if nothing in it is out of the ordinary."""
+        estimator = self._estimator
+        if self._suspects or self._late_since or int(np.abs(ticks).max()) > FAR // self._num:
+            return None
+        step = np.diff(ticks, prepend=self._ticks % self._modulus if self._modulus else self._ticks)
+        if self._modulus:
+            step %= self._modulus
+        if int(step.min()) <= 0:
+            return None
+        unwrapped = self._ticks + np.cumsum(step)
+        device_ns = self._ns_many(unwrapped) + (self._own_zero_ns + estimator.zero_ns)
+        x = device_ns - estimator.anchor_device
+        y = arrival_ns - estimator.anchor_host - x
+        rest = y - estimator.fit.offset - estimator.fit.slope * x
+        if not (rest.min() > -estimator.early_ns and rest.max() < self._late_ns):
+            return None
+        if self._modulus:
+            estimator.counts.wraps += int(unwrapped[-1]) // self._modulus - self._ticks // self._modulus
+        self._ticks, self._device_ns = int(unwrapped[-1]), int(device_ns[-1])
+        self._arrival_ns = int(arrival_ns[-1])
+        estimator.feed_many(x, y, rest)
+        if self._epoch != estimator.epoch:
+            device_ns[-1] = self._remember(self._ticks, self._arrival_ns)
+        return device_ns
+
+    @overload
+    def unwrap(self, ticks: int) -> int: ...
+    @overload
+    def unwrap(self, ticks: Ints) -> Ints: ...
+    def unwrap(self, ticks: int | Ints) -> int | Ints:
+        """Device time of ticks near the last observed ones, without learning from them."""
+        zero_ns = self._own_zero_ns + self._estimator.zero_ns
+        if isinstance(ticks, np.ndarray):
+            if self._modulus and self._epoch >= 0:
+                half = self._modulus // 2
+                ticks = self._ticks + (ticks - self._ticks % self._modulus + half) % self._modulus - half
+            return self._ns_many(ticks) + zero_ns
+        return self._ns(self._nearest(ticks)) + zero_ns
+
+    @property
+    def suspicious(self) -> bool:
+        """The last sample's ticks were impossible, unless the next ones prove a restart."""
+        return bool(self._suspects)
+
+    # -- samples out of the ordinary -------------------------------------------------------------------------------
+
+    def _observe_unsure(self, ticks: int, arrival_ns: int) -> int:
+        """The first sample of a stream or epoch, duplicates, disorder, stalls, restarts, garbage."""
+        estimator = self._estimator
+        if not estimator.started and abs(self._ns(ticks)) < FAR:
+            estimator.start(self._ns(ticks), arrival_ns)
+        unwrapped = self._choose_wrap(ticks, arrival_ns)
+        device_ns = self._axis_ns(unwrapped)
+        if abs(device_ns) >= FAR:
+            estimator.counts.rejected += 1
+            return estimator.device_ns_at(arrival_ns)
+        same_epoch = self._epoch == estimator.epoch
+        step_ns = device_ns - self._device_ns
+        if same_epoch and step_ns == 0:
+            estimator.counts.duplicates += 1
+            return device_ns
+        x = device_ns - estimator.anchor_device
+        rest = arrival_ns - estimator.anchor_host - x - estimator.fit.at(x)
+        if rest < -estimator.early_limit_ns(x) or (same_epoch and step_ns <= -STEP_BACK_NS):
+            return self._suspect(ticks, arrival_ns)
+        estimator.counts.rejected += len(self._suspects)
+        self._suspects.clear()
+        if same_epoch and step_ns < 0:
+            estimator.counts.reordered += 1
+            return device_ns
+        if rest > self._late_ns:
+            return self._late(unwrapped, arrival_ns, rest)
+        self._late_since = None
+        return self._accept(unwrapped, arrival_ns)
+
+    def _accept(self, unwrapped: int, arrival_ns: int) -> int:
+        """Learn from a sample that is in order again."""
+        estimator = self._estimator
+        if self._modulus and self._epoch == estimator.epoch:
+            estimator.counts.wraps += abs(unwrapped // self._modulus - self._ticks // self._modulus)
+        device_ns = self._remember(unwrapped, arrival_ns)
+        x = device_ns - estimator.anchor_device
+        y = arrival_ns - estimator.anchor_host - x
+        estimator.feed(x, y, y - estimator.fit.at(x))
+        return device_ns if self._epoch == estimator.epoch else self._remember(unwrapped, arrival_ns)
+
+    def _late(self, unwrapped: int, arrival_ns: int, rest: float) -> int:
+        """Held up on the way, or the device clock stood still: a backlog shrinks, a pause stays."""
+        estimator = self._estimator
+        estimator.counts.late += 1
+        device_ns = self._remember(unwrapped, arrival_ns)
+        if self._late_since is None:
+            self._late_since = (device_ns, rest)
+        waited_ns = device_ns - self._late_since[0]
+        if waited_ns < PERSISTS_NS:
+            return device_ns
+        if rest < self._late_since[1] - 0.1 * waited_ns:
+            self._late_since = (device_ns, rest)
+            return device_ns
+        self._late_since = None
+        estimator.counts.resets += 1
+        estimator.begin_epoch(round(rest))
+        return self._accept(unwrapped, arrival_ns)
+
+    def _suspect(self, ticks: int, arrival_ns: int) -> int:
+        """Earlier than possible, or far back: garbage, or the clock has restarted if the next ones agree."""
+        estimator = self._estimator
+        if self._suspects:
+            step = ticks - self._suspects[-1][0]
+            step_ns = self._ns(step % self._modulus if self._modulus else step)
+            drift_ns = arrival_ns - self._suspects[-1][1] - step_ns
+            if step_ns == 0:
+                return estimator.device_ns_at(arrival_ns)
+            if step_ns < 0 or abs(drift_ns) > LATE_NS:
+                estimator.counts.rejected += len(self._suspects)
+                self._suspects.clear()
+        self._suspects.append((ticks, arrival_ns))
+        if len(self._suspects) < SUSPECTS:
+            return estimator.device_ns_at(arrival_ns)
+        suspects, self._suspects = self._suspects, []
+        first_ticks, first_arrival_ns = suspects[0]
+        shift_ns = estimator.device_ns_at(first_arrival_ns) - self._axis_ns(first_ticks)
+        if self._epoch < 0 and estimator.last_x > 0:
+            self._own_zero_ns += shift_ns
+        else:
+            estimator.counts.resets += 1
+            estimator.begin_epoch(shift_ns)
+        self._late_since = None
+        self._ticks, self._epoch = first_ticks, -1
+        for tick, arrival in suspects:
+            step = (tick - self._ticks) % self._modulus if self._modulus else tick - self._ticks
+            device_ns = self._accept(self._ticks + step, arrival)
+        return device_ns
+
+    def _remember(self, unwrapped: int, arrival_ns: int) -> int:
+        self._epoch = self._estimator.epoch
+        self._ticks, self._arrival_ns = unwrapped, arrival_ns
+        self._device_ns = self._axis_ns(unwrapped)
+        return self._device_ns
+
+    # -- units and wraps -------------------------------------------------------------------------------------------
+
+    def _choose_wrap(self, ticks: int, arrival_ns: int) -> int:
+        """Unwrapped ticks: by the counter while it is watched closely, else by the arrival.
+
+        A sample cannot arrive before its event: of the possible times the latest that is not too early is taken.
+        """
+        estimator = self._estimator
+        if not self._modulus:
+            return ticks
+        if self._epoch == estimator.epoch and arrival_ns - self._arrival_ns < self._wrap_ns // 2:
+            return self._nearest(ticks)
+        expected_ns = estimator.device_ns_at(arrival_ns) - self._own_zero_ns - estimator.zero_ns
+        ticks %= self._modulus
+        room = (expected_ns + self._wrap_ns // 8) * self._den // self._num - ticks
+        return ticks + room // self._modulus * self._modulus
+
+    def _nearest(self, ticks: int) -> int:
+        """The unwrapped value of `ticks` that is nearest to the last sample's."""
+        if not self._modulus or self._epoch < 0:
+            return ticks
+        half = self._modulus // 2
+        return self._ticks + (ticks - self._ticks + half) % self._modulus - half
+
+    def _ns(self, ticks: int) -> int:
+        return ticks * self._num // self._den
+
+    def _ns_many(self, ticks: Ints) -> Ints:
+        whole, part = np.divmod(ticks, self._den)
+        ns: Ints = whole * self._num + part * self._num // self._den
+        return ns
+
+    def _axis_ns(self, unwrapped: int) -> int:
+        return self._ns(unwrapped) + self._own_zero_ns + self._estimator.zero_ns
+
+
+class ClockMap:
+    """Maps the ticks of one device clock to host time, learning from arrivals.
+
+    tick_hz, wrap_bits: of the first stream; 0 bits: the counter does not wrap.
+    prior_skew_ppm, prior_sigma_ppm: what is known of the device clock's rate error beforehand.
+    inline_refit: if False, the owner calls `refit`, say in a worker, whenever `refit_due`.
+    """
+
+    def __init__(
+        self,
+        tick_hz: float,
+        wrap_bits: int = 0,
+        *,
+        prior_skew_ppm: float = 0.0,
+        prior_sigma_ppm: float = 100.0,
+        inline_refit: bool = True,
+    ):
+        prior = SlopePrior(1 / (1 + prior_skew_ppm * PPM) - 1, max(prior_sigma_ppm, 1e-3) * PPM)
+        self._estimator = Estimator(prior, inline_refit)
+        self._stream = ClockStream(self._estimator, tick_hz, wrap_bits)
+        self.map = self._stream.map
+
+    def stream(self, tick_hz: float, wrap_bits: int = 0) -> ClockStream:
+        """Another stream of the same device clock, with ticks of its own."""
+        return ClockStream(self._estimator, tick_hz, wrap_bits)
+
+    @overload
+    def host_ns(self, device_ns: int) -> int: ...
+    @overload
+    def host_ns(self, device_ns: Ints) -> Ints: ...
+    def host_ns(self, device_ns: int | Ints) -> int | Ints:
+        """Host time of device times on the map's axis by what is known now; not held below any arrival."""
+        if isinstance(device_ns, np.ndarray):
+            return self._estimator.host_many(device_ns)
+        return self._estimator.host_ns(device_ns)
+
+    def host_suspended(self, duration_ns: int) -> None:
+        """The host slept: its monotonic clock stood still for `duration_ns` while the device ran on."""
+        if self._estimator.started and duration_ns > 0:
+            self._estimator.counts.suspends += 1
+            self._estimator.begin_epoch(-duration_ns)
+
+    @property
+    def refit_due(self) -> bool:
+        """Enough has come in for `refit` to be worth calling."""
+        return self._estimator.refit_due
+
+    def refit(self) -> None:
+        """Work out the line anew; a few ms, in any thread."""
+        self._estimator.refit()
+
+    @property
+    def epoch(self) -> int:
+        """Sync epoch, from 0; counts up when the clocks jumped against each other."""
+        return self._estimator.epoch
+
+    @property
+    def uncertainty_ns(self) -> float:
+        """One sigma of the stamps given now, apart from the constant floor of the delay."""
+        return self._estimator.sigma_ns()
+
+    @property
+    def skew_ppm(self) -> float:
+        """How much faster the device clock runs than the host's."""
+        return (1 / (1 + self._estimator.fit.slope) - 1) / PPM
+
+    @property
+    def skew_sigma_ppm(self) -> float:
+        """One sigma of `skew_ppm`."""
+        return self._estimator.fit.sd_slope / PPM
+
+    @property
+    def duplicates(self) -> int:
+        """Samples with the ticks of the one before."""
+        return self._estimator.counts.duplicates
+
+    @property
+    def reordered(self) -> int:
+        """Samples that came after a younger one."""
+        return self._estimator.counts.reordered
+
+    @property
+    def resets(self) -> int:
+        """Jumps of the device clock that began a new epoch."""
+        return self._estimator.counts.resets
+
+    @property
+    def suspends(self) -> int:
+        """Suspends of the host that were told."""
+        return self._estimator.counts.suspends
+
+    @property
+    def wraps(self) -> int:
+        """Wraps of the streams' counters."""
+        return self._estimator.counts.wraps
+
+    @property
+    def late(self) -> int:
+        """Samples held up for more than a second, mapped but not learnt from."""
+        return self._estimator.counts.late
+
+    @property
+    def rejected(self) -> int:
+        """Samples with impossible ticks, stamped with their arrival."""
+        return self._estimator.counts.rejected
+
+
+def refine(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0) -> Ints:
+    """Host times of a whole recording of one stream, each from all arrivals before and after it."""
+    ticks, arrival_ns = np.asarray(ticks, dtype=np.int64), np.asarray(arrival_ns, dtype=np.int64)
+    device_ns, epochs, plain = _unwrap_all(ticks, arrival_ns, tick_hz, wrap_bits)
+    host_ns = arrival_ns.copy()
+    for epoch in np.unique(epochs):
+        chosen = np.flatnonzero(epochs == epoch)
+        learn = chosen[plain[chosen]]
+        if not learn.size:
+            continue
+        learn = learn[np.argsort(device_ns[learn], kind="stable")]
+        anchor_device, anchor_host = device_ns[learn[0]], arrival_ns[learn[0]]
+        x = (device_ns[learn] - anchor_device).astype(np.float64)
+        y = (arrival_ns[learn] - anchor_host).astype(np.float64) - x
+        ahead = device_ns[chosen] - anchor_device
+        offset = refine_epoch(x, y).at(ahead.astype(np.float64))
+        host_ns[chosen] = anchor_host + ahead + np.rint(offset).astype(np.int64)
+    return np.minimum(host_ns, arrival_ns)
+
+
+def _unwrap_all(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int) -> tuple[Ints, Ints, NDArray[np.bool_]]:
+    """Device time, sync epoch and whether to learn from it, for each sample of a recording."""
+    clock = ClockMap(tick_hz, wrap_bits)
+    stream = clock.stream(tick_hz, wrap_bits)
+    device_ns, epochs = np.zeros_like(ticks), np.zeros_like(ticks)
+    plain = np.zeros(ticks.size, dtype=np.bool_)
+    epoch = begin = 0
+    suspect = np.zeros(ticks.size, dtype=np.bool_)
+    for i, (tick, arrival) in enumerate(zip(ticks.tolist(), arrival_ns.tolist(), strict=True)):
+        unusual = clock.duplicates + clock.reordered + clock.late
+        device_ns[i] = stream.observe(tick, arrival)
+        suspect[i] = stream.suspicious
+        plain[i] = not suspect[i] and unusual == clock.duplicates + clock.reordered + clock.late
+        if clock.epoch != epoch:
+            for j in range(i - 1, begin - 1, -1):  # those that came before the new epoch was certain
+                device = stream.unwrap(int(ticks[j]))
+                rest = int(arrival_ns[j]) - clock.host_ns(device)
+                former = int(arrival_ns[j]) - clock.host_ns(int(device_ns[j]))
+                if device >= device_ns[j + 1] or not (suspect[j] or abs(rest) < abs(former)):
+                    break
+                device_ns[j], epochs[j], plain[j] = device, clock.epoch, True
+            epoch, begin = clock.epoch, i
+        epochs[i] = epoch
+    return device_ns, epochs, plain

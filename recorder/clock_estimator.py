@@ -1,0 +1,280 @@
+"""What one device clock and the host's have to do with each other, sync epoch by sync epoch.
+
+The `Estimator` is fed with device times on one axis and their arrivals.  It condenses them into buckets, fits the line
+under them (`recorder.clock_fit`) and puts it out without steps: a new line is approached at a limited rate.
+`recorder.clock` wraps it for users; `ClockStream` brings the samples of each stream onto the axis.
+
+x is device time and y arrival minus device time, in ns since the anchor of the first sample.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorder.clock_fit import PPM, Bucket, Floats, Line, SlopePrior, blend, summarise
+
+Ints = NDArray[np.int64]
+
+S = 1_000_000_000  # ns
+
+BUCKET_S = (0.05, 1.0, 5.0)  # shortest, usual, longest when samples are few
+BUCKET_SHARE = 0.1  # of the epoch's age while it is young
+BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
+WINDOW_S = 600
+REFIT_S = 2.0
+SLEW = ((5.0, 0.2), (30.0, 5e-3), (math.inf, 500 * PPM))  # up to this age of the epoch: seconds per second
+KEPT_SKEW_PPM = 2.0  # one sigma of a device's skew across a restart
+LATE_NS = 1 * S  # later than this: a stall, or the device clock has stood still
+PERSISTS_NS = 3 * S
+EARLY_FLOOR_NS = 20_000_000  # earlier than possible by this and ten spreads: the clock has jumped
+SETTLED_S = 2.0
+KEPT_EPOCHS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class SlewedLine:
+    """The line as it is put out: the gap to the former one closes at `rate` from `since_x` on."""
+
+    start_x: float
+    offset: float
+    slope: float
+    gap: float = 0.0
+    since_x: float = 0.0
+    rate: float = 0.0
+
+    def at(self, x: float) -> float:
+        """Offset at x, ns."""
+        gap = self.gap
+        if gap:
+            left = abs(gap) - self.rate * max(x - self.since_x, 0.0)
+            gap = math.copysign(left, gap) if left > 0 else 0.0
+        return self.offset + self.slope * x + gap
+
+    def many(self, x: Floats) -> Floats:
+        """Offsets at many x, ns."""
+        line = self.offset + self.slope * x
+        if self.gap:
+            left = np.maximum(abs(self.gap) - self.rate * np.maximum(x - self.since_x, 0.0), 0.0)
+            line += math.copysign(1.0, self.gap) * left
+        return line
+
+    def retarget(self, offset: float, slope: float, x: float, rate: float) -> SlewedLine:
+        """Move on to another line without a step at x."""
+        gap = self.at(x) - (offset + slope * x)
+        return SlewedLine(self.start_x, offset, slope, gap, x, rate)
+
+
+@dataclass(slots=True)
+class Counts:
+    """What was out of the ordinary; `late` and `rejected` samples were mapped but not learnt from."""
+
+    duplicates: int = 0
+    reordered: int = 0
+    resets: int = 0
+    suspends: int = 0
+    wraps: int = 0
+    late: int = 0
+    rejected: int = 0
+
+
+class Estimator:
+    """The line between one device clock and the host's.
+
+    Calls must not overlap, but `refit` may run in another thread than the rest.
+    """
+
+    def __init__(self, prior: SlopePrior, inline_refit: bool):
+        self.inline_refit = inline_refit
+        self.refit_due = False
+        self.counts = Counts()
+        self.started = False
+        self.epoch = 0
+        self.anchor_device = 0
+        self.anchor_host = 0
+        self.zero_ns = 0  # added to device times; changes with the epoch so that the axis runs on
+        self.line = SlewedLine(-math.inf, 0.0, prior.slope)
+        self.fit = Line(0.0, prior.slope, prior.sigma, 1e6, 0.0)
+        self.last_x = 0.0
+        self._first_prior = prior
+        self._past: list[SlewedLine] = []
+        self._begin(0.0, prior)
+
+    def start(self, device_ns: int, arrival_ns: int) -> None:
+        """Put the anchor on the first sample."""
+        self.started = True
+        self.anchor_device, self.anchor_host = device_ns, arrival_ns
+
+    # -- evaluating ------------------------------------------------------------------------------------------------
+
+    def host_ns(self, device_ns: int) -> int:
+        """Host time of a device time by what is known now."""
+        ahead = device_ns - self.anchor_device
+        line = self.line
+        if ahead < line.start_x:
+            line = next((past for past in reversed(self._past) if ahead >= past.start_x), line)
+        return self.anchor_host + ahead + round(line.at(ahead))
+
+    def host_many(self, device_ns: Ints) -> Ints:
+        """`host_ns` of many."""
+        ahead = device_ns - self.anchor_device
+        x = ahead.astype(np.float64)
+        offset = self.line.many(x)
+        end_x = self.line.start_x
+        for past in reversed(self._past):
+            offset = np.where((x < end_x) & (x >= past.start_x), past.many(x), offset)
+            end_x = past.start_x
+        host: Ints = self.anchor_host + ahead + np.rint(offset).astype(np.int64)
+        return host
+
+    def device_ns_at(self, host_ns: int) -> int:
+        """Device time on the axis at a host time."""
+        fit = self.fit
+        return self.anchor_device + round((host_ns - self.anchor_host - fit.offset) / (1 + fit.slope))
+
+    def sigma_ns(self) -> float:
+        """One sigma of what is put out now, floor of the delay apart."""
+        return self.fit.sigma_ns(self.last_x) + abs(self.line.at(self.last_x) - self.fit.at(self.last_x))
+
+    def early_limit_ns(self, x: float) -> float:
+        """How far below the line an arrival at x may be and still be believed."""
+        return self.early_ns + 10 * self.fit.sd_slope * max(x - self.last_x, 0.0)
+
+    # -- epochs ----------------------------------------------------------------------------------------------------
+
+    def begin_epoch(self, shift_ns: int) -> None:
+        """The clocks jumped against each other: shift the device axis so that the line runs on, learn anew."""
+        fit = self.fit
+        self.zero_ns += shift_ns
+        self.epoch += 1
+        self._past = [*self._past, self.line][-KEPT_EPOCHS:]
+        sigma = min(max(KEPT_SKEW_PPM * PPM, fit.sd_slope), self._first_prior.sigma)
+        self._begin(self.last_x, SlopePrior(fit.slope, sigma))
+        self.line = SlewedLine(self.last_x, fit.offset, fit.slope)
+        self.fit = Line(fit.offset, fit.slope, sigma, self.fit.sd_level_ns, self.last_x)
+
+    def _begin(self, x: float, prior: SlopePrior) -> None:
+        self.fit = Line(self.line.offset, prior.slope, prior.sigma, 1e6, x)
+        self.early_ns = float(LATE_NS)
+        self.last_x = x
+        self.refit_due = False
+        self._prior = prior
+        self._begin_x = x
+        self._next_refit_x = x
+        self._buckets: list[Bucket] = []
+        self._open_x: list[int] = []
+        self._open_y: list[int] = []
+        self._open_end = x
+        self._high_since: float | None = None
+        self._ready: tuple[int, Line] | None = None
+
+    # -- learning --------------------------------------------------------------------------------------------------
+
+    def feed(self, x: int, y: int, rest: float) -> None:
+        """Learn from one sample, `rest` ns above the line."""
+        if rest < 0:
+            self._lower(rest, x)
+        self._open_x.append(x)
+        self._open_y.append(y)
+        if x > self.last_x:
+            self.last_x = x
+            if x >= self._open_end:
+                self._close_bucket()
+        if self._ready is not None:
+            self._adopt()
+
+    def feed_many(self, x: Ints, y: Ints, rest: Floats) -> None:
+        """Learn from samples in ascending order."""
+        low = int(rest.argmin())
+        if rest[low] < 0:
+            self._lower(float(rest[low]), float(x[low]))
+        start, epoch = 0, self.epoch
+        while start < x.size and self.epoch == epoch:
+            stop = max(start + 1, int(np.searchsorted(x, self._open_end, side="right")))
+            self._open_x += x[start:stop].tolist()
+            self._open_y += y[start:stop].tolist()
+            self.last_x = max(self.last_x, float(x[min(stop, x.size) - 1]))
+            start = stop
+            if self.last_x >= self._open_end:
+                self._close_bucket()
+        if self._ready is not None:
+            self._adopt()
+
+    def _lower(self, by_ns: float, x: float) -> None:
+        """A point lies below the line: move it down at once, what is put out follows at its rate."""
+        self.fit = self.fit.lowered(by_ns)
+        self.line = self.line.retarget(self.fit.offset, self.fit.slope, x, self._slew_rate())
+
+    def _slew_rate(self) -> float:
+        age_s = self._age_s()
+        return next(rate for until_s, rate in SLEW if age_s < until_s)
+
+    def _age_s(self) -> float:
+        return (self.last_x - self._begin_x) / S
+
+    def _pace_ns(self, longest_s: float) -> float:
+        """Times that grow with the age of the epoch up to a longest one."""
+        return S * min(max(BUCKET_S[0], BUCKET_SHARE * self._age_s()), longest_s)
+
+    def _close_bucket(self) -> None:
+        """The open bucket has had its time: condense it unless it is still thin, and see whether to refit."""
+        last = self.last_x
+        thin = len(self._open_x) < BUCKET_SAMPLES
+        if thin and last - self._open_x[0] < self._pace_ns(BUCKET_S[2]):
+            self._open_end = last
+            return
+        bucket = summarise(*self._open_points(), self.fit.slope)
+        self._buckets.append(bucket)
+        self._open_x, self._open_y = [], []
+        self._open_end = last + self._pace_ns(BUCKET_S[1])
+        while last - self._buckets[0].last_x > WINDOW_S * S:
+            del self._buckets[0]
+        if self._stood_still(bucket):
+            self.counts.resets += 1
+            self.begin_epoch(round(bucket.low_y - self.fit.at(bucket.low_x)))
+        elif last >= self._next_refit_x:
+            self._next_refit_x = last + self._pace_ns(REFIT_S)
+            self.refit_due = True
+            if self.inline_refit:
+                self.refit()
+
+    def _open_points(self) -> tuple[Floats, Floats]:
+        x, y = np.array(self._open_x, dtype=np.float64), np.array(self._open_y, dtype=np.float64)
+        if np.any(np.diff(x) < 0):  # streams of one clock interleave
+            order = np.argsort(x, kind="stable")
+            return x[order], y[order]
+        return x, y
+
+    def _stood_still(self, bucket: Bucket) -> bool:
+        """Whole buckets far above the line for seconds: the device clock has paused."""
+        if bucket.low_y - self.fit.at(bucket.low_x) <= self.early_ns:
+            self._high_since = None
+            return False
+        if self._high_since is None:
+            self._high_since = bucket.low_x
+        return bucket.last_x - self._high_since >= PERSISTS_NS
+
+    def refit(self) -> None:
+        """Work out the line anew; a worker may call it when `refit_due`."""
+        self.refit_due = False
+        epoch, buckets, prior = self.epoch, self._buckets[:], self._prior
+        if buckets:
+            self._ready = (epoch, blend(buckets, prior))
+
+    def _adopt(self) -> None:
+        """Take over a finished refit, below what has come since."""
+        ready, self._ready = self._ready, None
+        if ready is None or ready[0] != self.epoch:
+            return
+        fit = ready[1]
+        under = min((bucket.low_y - fit.at(bucket.low_x) for bucket in self._buckets[-4:]), default=0.0)
+        if self._open_x:
+            x, y = self._open_points()
+            under = min(under, float((y - fit.offset - fit.slope * x).min()))
+        self.fit = fit = fit.lowered(min(under, 0.0))
+        self.line = self.line.retarget(fit.offset, fit.slope, self.last_x, self._slew_rate())
+        if self._age_s() > SETTLED_S:
+            self.early_ns = min(EARLY_FLOOR_NS + 10 * fit.spread_ns, float(LATE_NS))
