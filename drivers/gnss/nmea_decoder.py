@@ -1,0 +1,445 @@
+"""NMEA 0183: bytes in, one fix per epoch out.
+
+Three steps. The scanner finds sentences with a good checksum among whatever else is on the line. The sentences of one
+epoch, known by their UTC time of day and in no particular order, are gathered. An epoch that is over becomes a fix:
+position from GGA, accuracy from GST, date from RMC or ZDA.
+"""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import accumulate
+from typing import Literal
+
+from drivers.samples import FixSample
+
+MAX_SENTENCE_BYTES = 512  # the standard says 82; high-precision receivers do not keep to it
+MAX_UBX_PAYLOAD_BYTES = 4096
+EMITTED_QUALITIES = frozenset((1, 2, 3, 4, 5, 9))  # not: none, dead reckoning, manual, simulator
+QUALITY_OF_RMC_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
+QUALITY_RANK = (4, 5, 9, 3, 2, 1)  # best first
+UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 9: 2.5}
+"""Horizontal error, one sigma, for a dilution of 1, by quality: rough, from what receivers with GST say."""
+VERTICAL_PER_HORIZONTAL = 2.0
+MAX_HDOP = 99.0  # receivers send 99.9 for "unknown"
+
+NS_PER_S = 1_000_000_000
+DAY_NS = 86_400 * NS_PER_S
+ROLLOVER_NS = 1024 * 7 * DAY_NS
+
+_START = re.compile(rb"[$!\xb5\xd3]")
+_BODY = re.compile(rb"[\x20-\x23\x25-\x29\x2b-\x7e]*")  # printable, neither $ nor *
+_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
+_TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
+_COORDINATE = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
+
+TIME_FIELD = {"GGA": 1, "RMC": 1, "GST": 1, "ZDA": 1, "GNS": 1, "GBS": 1, "GRS": 1, "GLL": 5}
+Source = Literal["gst", "dop", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sentence:
+    """A sentence with a good checksum; offset: of its first byte in the stream. fields[0] is the address (GPGGA)."""
+
+    offset: int
+    fields: list[str]
+
+
+@dataclass(slots=True)
+class SentenceScanner:
+    """Finds sentences in any mixture of NMEA and binary; whole UBX and RTCM 3 messages are stepped over.
+
+    bad_frames: sentences with a wrong or no checksum, or cut. skipped_bytes: bytes that belong to nothing known.
+    """
+
+    bad_frames: int = 0
+    skipped_bytes: int = 0
+    _buffer: bytearray = field(default_factory=bytearray)
+    _buffer_offset: int = 0
+
+    def feed(self, data: bytes) -> list[Sentence]:
+        """The sentences that `data` completes, AIS and proprietary ones included."""
+        self._buffer += data
+        sentences: list[Sentence] = []
+        position = 0
+        while match := _START.search(self._buffer, position):
+            self._skip(position, match.start())
+            position = match.start()
+            length = self._length(position)
+            if length is None:
+                break
+            if length == 0:  # no message begins here
+                self._skip(position, position + 1)
+                position += 1
+                continue
+            if self._buffer[position] == ord("$"):
+                body = self._buffer[position + 1 : position + length - 3]
+                sentences.append(Sentence(self._buffer_offset + position, body.decode("ascii").split(",")))
+            position += length
+        else:
+            self._skip(position, len(self._buffer))
+            position = len(self._buffer)
+        del self._buffer[:position]
+        self._buffer_offset += position
+        return sentences
+
+    def _skip(self, start: int, end: int) -> None:
+        gap = self._buffer[start:end]
+        self.skipped_bytes += len(gap) - gap.count(b"\r") - gap.count(b"\n")  # line ends are no garbage
+
+    def _length(self, position: int) -> int | None:
+        """Bytes of the message at `position`; 0 when there is none, None while that cannot be told."""
+        first = self._buffer[position]
+        if first == 0xB5:
+            return _ubx_length(self._buffer, position)
+        if first == 0xD3:
+            return _rtcm_length(self._buffer, position)
+        length = _sentence_length(self._buffer, position)
+        if length == 0:
+            self.bad_frames += 1
+        return length
+
+
+def _sentence_length(buffer: bytearray, position: int) -> int | None:
+    end = _BODY.match(buffer, position + 1, position + MAX_SENTENCE_BYTES).end()  # type: ignore[union-attr]
+    if end >= position + MAX_SENTENCE_BYTES:
+        return 0
+    if end == len(buffer) or (buffer[end] == ord("*") and len(buffer) < end + 3):
+        return None
+    if not _CHECKSUM.match(buffer, end):
+        return 0
+    checksum = 0
+    for byte in buffer[position + 1 : end]:
+        checksum ^= byte
+    return end + 3 - position if checksum == int(buffer[end + 1 : end + 3], 16) else 0
+
+
+def _ubx_length(buffer: bytearray, position: int) -> int | None:
+    available = len(buffer) - position
+    if available >= 2 and buffer[position + 1] != 0x62:
+        return 0
+    if available < 6:
+        return None
+    size = int.from_bytes(buffer[position + 4 : position + 6], "little")
+    if size > MAX_UBX_PAYLOAD_BYTES:
+        return 0
+    if available < size + 8:
+        return None
+    sums = list(accumulate(buffer[position + 2 : position + size + 6]))
+    checksum = bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
+    return size + 8 if buffer[position + size + 6 : position + size + 8] == checksum else 0
+
+
+def _rtcm_length(buffer: bytearray, position: int) -> int | None:
+    available = len(buffer) - position
+    if available >= 2 and buffer[position + 1] & 0xFC:  # six reserved bits
+        return 0
+    if available < 3:
+        return None
+    size = (buffer[position + 1] & 0x03) << 8 | buffer[position + 2]
+    if available < size + 6:
+        return None
+    crc = 0
+    for byte in buffer[position : position + size + 3]:
+        crc = (crc << 8 & 0xFFFFFF) ^ _CRC24Q[crc >> 16 ^ byte]
+    return size + 6 if crc == int.from_bytes(buffer[position + size + 3 : position + size + 6]) else 0
+
+
+def _crc24q_table() -> list[int]:
+    table = []
+    for byte in range(256):
+        crc = byte << 16
+        for _ in range(8):
+            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
+        table.append(crc & 0xFFFFFF)
+    return table
+
+
+_CRC24Q = _crc24q_table()
+
+
+@dataclass(slots=True)
+class _Position:
+    """What GGA says, or RMC in its place."""
+
+    is_multi_system: bool
+    quality: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float | None = None
+    undulation_m: float | None = None
+    satellites: int | None = None
+    hdop: float | None = None
+    correction_age_s: float | None = None
+
+    def is_better_than(self, other: "_Position | None") -> bool:
+        if other is None:
+            return True
+        if other.is_multi_system or self.is_multi_system:
+            return not other.is_multi_system
+        return QUALITY_RANK.index(self.quality) < QUALITY_RANK.index(other.quality)
+
+
+@dataclass(slots=True)
+class _Epoch:
+    """Sentences with one UTC time of day.
+
+    seen: how often each came; tail: the last one. is_incomplete: something came after it was taken to be over.
+    """
+
+    day_ns: int
+    offset: int
+    gga: _Position | None = None
+    is_refused: bool = False
+    rmc: _Position | None = None
+    date_ns: int | None = None
+    sigmas_m: tuple[float, float | None] | None = None
+    seen: dict[str, int] = field(default_factory=dict)
+    tail: tuple[str, int] | None = None
+    is_over: bool = False
+    has_fix: bool = False
+    is_incomplete: bool = False
+
+
+@dataclass(slots=True)
+class NmeaDecoder:
+    """Fixes out of an NMEA stream, one per epoch.
+
+    reference_utc_ns: now, to within twelve hours where the receiver sends no date, else to within ten years: it
+    completes dates and undoes jumps of 1024 weeks. `feed` gives a fix as soon as its epoch is known to be over: at the
+    sentence that has ended the epochs before, else at the first of the next epoch. `flush` is for the pause between.
+    sentences: how many came. rollovers: by how many times 1024 weeks the receiver's date was off, the last time.
+    """
+
+    reference_utc_ns: int
+    sentences: int = 0
+    rollovers: int = 0
+    _scanner: SentenceScanner = field(default_factory=SentenceScanner)
+    _epoch: _Epoch | None = None
+    _last_utc_ns: int | None = None
+    _ender: tuple[str, int] | None = None
+    _previous_tail: tuple[str, int] | None = None
+
+    @property
+    def bad_frames(self) -> int:
+        """Sentences with a wrong or no checksum, or cut."""
+        return self._scanner.bad_frames
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes that belong to no sentence or binary message."""
+        return self._scanner.skipped_bytes
+
+    def feed(self, data: bytes) -> list[FixSample]:
+        """The fixes that `data` completes."""
+        fixes: list[FixSample] = []
+        for sentence in self._scanner.feed(data):
+            self.sentences += 1
+            self._take(sentence, fixes)
+        return fixes
+
+    def flush(self) -> list[FixSample]:
+        """The fix of the open epoch, when the line has gone quiet; what still comes of that epoch is left out."""
+        fixes: list[FixSample] = []
+        self._close(fixes)
+        return fixes
+
+    def _take(self, sentence: Sentence, fixes: list[FixSample]) -> None:
+        address = sentence.fields[0]
+        kind = address[2:]
+        if len(address) != 5 or (place := TIME_FIELD.get(kind)) is None or place >= len(sentence.fields):
+            return
+        day_ns = _time_of_day_ns(sentence.fields[place])
+        if day_ns is None:
+            return
+        if self._epoch is None or self._epoch.day_ns != day_ns:
+            self._close(fixes)
+            self._learn()
+            self._epoch = _Epoch(day_ns, sentence.offset)
+        if (gather := _GATHER.get(kind)) is not None:
+            gather(self._epoch, sentence.fields)
+            if kind != "ZDA":  # it brings a date only, often once a second: it must neither end nor spoil an epoch
+                self._mark(address, fixes)
+
+    def _mark(self, address: str, fixes: list[FixSample]) -> None:
+        """Note that a sentence of the fix has come, and close the epoch when it is the one that ends the cycle."""
+        epoch = self._epoch
+        assert epoch is not None
+        epoch.is_incomplete |= epoch.is_over
+        count = epoch.seen[address] = epoch.seen.get(address, 0) + 1
+        epoch.tail = (address, count)
+        if epoch.tail == self._ender:
+            self._close(fixes)
+
+    def _learn(self) -> None:
+        """What a whole epoch tells about the next: how the cycle ends, and a date that came after its fix was given.
+
+        Two epochs that ended alike show the end of the cycle; a sentence after the learned end shows that it is wrong.
+        """
+        epoch = self._epoch
+        if epoch is None or epoch.tail is None:
+            return
+        if epoch.has_fix:
+            self._last_utc_ns = self._utc_ns(epoch)
+        if epoch.tail == self._previous_tail:
+            self._ender = epoch.tail
+        elif epoch.is_incomplete:
+            self._ender = None
+        self._previous_tail = epoch.tail
+
+    def _close(self, fixes: list[FixSample]) -> None:
+        epoch = self._epoch
+        if epoch is None or epoch.is_over:
+            return
+        epoch.is_over = True
+        position = epoch.gga or (None if epoch.is_refused else epoch.rmc)
+        if position is None or position.quality not in EMITTED_QUALITIES:
+            return
+        epoch.has_fix = True
+        accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m)
+        fix = FixSample(
+            device_ticks=self._utc_ns(epoch),
+            stream_offset=epoch.offset,
+            latitude_deg=position.latitude_deg,
+            longitude_deg=position.longitude_deg,
+            altitude_m=position.altitude_m,
+            undulation_m=position.undulation_m,
+            accuracy_m=accuracy_m,
+            vertical_accuracy_m=vertical_accuracy_m,
+            accuracy_source=source,
+            quality=position.quality,
+            satellites=position.satellites,
+            hdop=position.hdop,
+            correction_age_s=position.correction_age_s,
+        )
+        fixes.append(fix)
+
+    def _utc_ns(self, epoch: _Epoch) -> int:
+        """UTC of an epoch: with the date it was sent with, else on the day that brings it nearest to the last one."""
+        if epoch.date_ns is not None:
+            utc_ns = epoch.date_ns + epoch.day_ns
+            # Receivers jump back only; a host without a set clock (1970) must not make a good date worse.
+            self.rollovers = max(0, _rounded(self.reference_utc_ns - utc_ns, ROLLOVER_NS))
+            return utc_ns + self.rollovers * ROLLOVER_NS
+        near_ns = self.reference_utc_ns if self._last_utc_ns is None else self._last_utc_ns
+        return epoch.day_ns + _rounded(near_ns - epoch.day_ns, DAY_NS) * DAY_NS
+
+
+def _gather_gga(epoch: _Epoch, fields: list[str]) -> None:
+    quality = _integer(fields[6]) if len(fields) >= 12 else None
+    if quality is None:  # receivers that leave it empty say with RMC whether the position is good
+        return
+    if quality not in EMITTED_QUALITIES:
+        epoch.is_refused = True
+        return
+    latitude_deg, longitude_deg = _coordinates(fields[2:6])
+    if latitude_deg is None or longitude_deg is None:
+        return
+    position = _Position(
+        is_multi_system=fields[0].startswith("GN"),
+        quality=quality,
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=_number(fields[9], -2_000, 100_000) if fields[10] in ("M", "") else None,
+        undulation_m=_number(fields[11], -200, 200),
+        satellites=_integer(fields[7]),
+        hdop=_number(fields[8], 0, MAX_HDOP),
+        correction_age_s=_number(fields[13], 0, 1e6) if len(fields) > 13 else None,
+    )
+    if position.is_better_than(epoch.gga):
+        epoch.gga = position
+
+
+def _gather_rmc(epoch: _Epoch, fields: list[str]) -> None:
+    if len(fields) < 10 or fields[2] != "A":  # a void sentence may carry any date
+        return
+    epoch.date_ns = _date_ns(fields[9][:2], fields[9][2:4], fields[9][4:])
+    quality = QUALITY_OF_RMC_MODE.get(fields[12], 0) if len(fields) > 12 else 1
+    latitude_deg, longitude_deg = _coordinates(fields[3:7])
+    if latitude_deg is not None and longitude_deg is not None:
+        epoch.rmc = _Position(fields[0].startswith("GN"), quality, latitude_deg, longitude_deg)
+
+
+def _gather_gst(epoch: _Epoch, fields: list[str]) -> None:
+    if len(fields) < 9:
+        return
+    latitude_m, longitude_m = _number(fields[6], 0, 1e6), _number(fields[7], 0, 1e6)
+    if latitude_m is not None and longitude_m is not None and latitude_m + longitude_m > 0:
+        epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), _number(fields[8], 0, 1e6))
+
+
+def _gather_zda(epoch: _Epoch, fields: list[str]) -> None:
+    if len(fields) >= 5 and epoch.date_ns is None:
+        epoch.date_ns = _date_ns(*fields[2:5])
+
+
+_GATHER: dict[str, Callable[[_Epoch, list[str]], None]] = {
+    "GGA": _gather_gga,
+    "RMC": _gather_rmc,
+    "GST": _gather_gst,
+    "ZDA": _gather_zda,
+}
+
+
+def _accuracy(
+    position: _Position, sigmas_m: tuple[float, float | None] | None
+) -> tuple[float | None, float | None, Source]:
+    if sigmas_m is not None:
+        return *sigmas_m, "gst"
+    if not position.hdop:
+        return None, None, "none"
+    accuracy_m = position.hdop * UERE_M[position.quality]
+    return accuracy_m, accuracy_m * VERTICAL_PER_HORIZONTAL, "dop"
+
+
+def _number(text: str, low: float, high: float) -> float | None:
+    if not _NUMBER.fullmatch(text):
+        return None
+    value = float(text)
+    return value if low <= value <= high else None
+
+
+def _integer(text: str) -> int | None:
+    return int(text) if text.isdigit() and len(text) <= 4 else None
+
+
+def _coordinates(fields: list[str]) -> tuple[float | None, float | None]:
+    return _degrees(fields[0], fields[1], "NS", 90), _degrees(fields[2], fields[3], "EW", 180)
+
+
+def _degrees(text: str, hemisphere: str, letters: str, limit: int) -> float | None:
+    match = _COORDINATE.fullmatch(text)
+    if match is None or len(hemisphere) != 1 or hemisphere not in letters or (minutes := float(match[2])) >= 60:
+        return None
+    degrees = int(match[1]) + minutes / 60
+    if degrees > limit:
+        return None
+    return degrees if hemisphere == letters[0] else -degrees
+
+
+def _time_of_day_ns(text: str) -> int | None:
+    match = _TIME.fullmatch(text)
+    if match is None:
+        return None
+    hour, minute, second = int(match[1]), int(match[2]), int(match[3])
+    if hour > 23 or minute > 59 or second > 60:  # a leap second is 23:59:60, the same instant as 0:00 of the next day
+        return None
+    return (hour * 3600 + minute * 60 + second) * NS_PER_S + int((match[4] or "")[:9].ljust(9, "0"))
+
+
+def _date_ns(day: str, month: str, year: str) -> int | None:
+    if not (day.isdigit() and month.isdigit() and year.isdigit() and len(year) in (2, 4)):
+        return None
+    full_year = int(year) if len(year) == 4 else int(year) + (2000 if int(year) < 80 else 1900)
+    try:
+        date = datetime(full_year, int(month), int(day), tzinfo=UTC)
+    except ValueError:
+        return None
+    return int(date.timestamp()) * NS_PER_S
+
+
+def _rounded(value: int, unit: int) -> int:
+    return (value + unit // 2) // unit

@@ -1,0 +1,296 @@
+"""NMEA decoder against gpsd's reading of real captures, and the driver over a pty."""
+
+import json
+from datetime import UTC, datetime
+from functools import reduce
+from itertools import pairwise
+from operator import xor
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, NmeaDecoder
+from drivers.samples import FixSample
+
+DATA = Path(__file__).parent.parent / "data" / "nmea"
+# The day of each capture; the coldboot one loses its date on the way.
+CAPTURES = {
+    "nmea-rtk": "2020-03-18",
+    "polarx2": "2012-03-22",
+    "meinberg-gps164": "2023-12-18",
+    "rx210": "2016-04-03",
+    "firefly-II": "2010-07-08",
+    "ublox-zed-f9p-nmea": "2019-04-12",
+    "gp-320fw-2019-04-07-coldboot": "2019-04-07",
+}
+NOON = "2026-11-22T12:00:00"
+
+
+def utc_ns(text: str) -> int:
+    moment = datetime.fromisoformat(text.removesuffix("Z")).replace(tzinfo=UTC)
+    return int(moment.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+
+
+def sentence(body: str) -> bytes:
+    return f"${body}*{reduce(xor, body.encode(), 0):02X}\r\n".encode()
+
+
+def gga(time: str = "120000.00", quality: int = 1, altitude: str = "14.2", address: str = "GPGGA") -> bytes:
+    return sentence(f"{address},{time},6010.428,N,02454.390,E,{quality},12,0.80,{altitude},M,17.9,M,,")
+
+
+def rmc(time: str = "120000.00", date: str = "221126", mode: str = "A") -> bytes:
+    return sentence(f"GPRMC,{time},A,6010.400,N,02454.300,E,0.1,0.0,{date},,,{mode}")
+
+
+def gst(time: str = "120000.00") -> bytes:
+    return sentence(f"GPGST,{time},1.0,,,,0.03,0.04,0.10")
+
+
+def decode(data: bytes, reference: str = NOON) -> list[FixSample]:
+    decoder = NmeaDecoder(utc_ns(reference))
+    return decoder.feed(data) + decoder.flush()
+
+
+@pytest.mark.parametrize(("name", "day"), CAPTURES.items())
+def test_agrees_with_gpsd(name: str, day: str) -> None:
+    fixes = {fix.device_ticks: fix for fix in decode((DATA / f"{name}.log").read_bytes(), day + "T12:00:00")}
+    reports = map(json.loads, (DATA / f"{name}.log.chk").read_text().splitlines())
+    # gpsd reports several times in an epoch, the last time with everything; without a position the mode is 1.
+    expected = {utc_ns(report["time"]): report for report in reports if "time" in report and report["mode"] > 1}
+    if "coldboot" in name:  # before the first date gpsd gives a position without a time; we know the day
+        del fixes[utc_ns("2019-04-07T00:03:43.030")]
+    assert expected
+    assert fixes.keys() == expected.keys()
+    for ticks, fix in fixes.items():
+        report = expected[ticks]
+        assert fix.latitude_deg == pytest.approx(report["lat"], abs=2e-8)
+        assert fix.longitude_deg == pytest.approx(report["lon"], abs=2e-8)
+        assert (fix.altitude_m is None) == ("altMSL" not in report)
+        if fix.altitude_m is not None:
+            assert fix.altitude_m == pytest.approx(report["altMSL"], abs=0.006)
+            assert fix.undulation_m == pytest.approx(report["geoidSep"], abs=0.006)
+
+
+def test_sentences_between_binary_messages() -> None:
+    data = (DATA / "ublox-zed-f9p.mixed").read_bytes()
+    decoder = NmeaDecoder(utc_ns("2019-04-12T00:00:00"))
+    fixes = decoder.feed(data) + decoder.flush()
+    assert len(fixes) == 13 == data.count(b"$GNGGA")
+    # The capture begins inside of a binary message; from the first sentence on nothing is garbage.
+    whole = NmeaDecoder(utc_ns("2019-04-12T00:00:00"))
+    whole.feed(data[data.index(b"$GNRMC") :])
+    assert (whole.bad_frames, whole.skipped_bytes) == (0, 0)
+
+
+def test_fix_of_an_epoch() -> None:
+    (fix,) = decode(b"\xff\x00" + rmc() + gga(quality=4) + gst())
+    assert fix == FixSample(
+        device_ticks=utc_ns(NOON),
+        stream_offset=2,
+        latitude_deg=pytest.approx(60 + 10.428 / 60, abs=1e-12),
+        longitude_deg=pytest.approx(24 + 54.390 / 60, abs=1e-12),
+        altitude_m=14.2,
+        undulation_m=17.9,
+        accuracy_m=pytest.approx(0.05),
+        vertical_accuracy_m=0.10,
+        accuracy_source="gst",
+        quality=4,
+        satellites=12,
+        hdop=0.80,
+        correction_age_s=None,
+    )
+
+
+def test_accuracy_without_gst_is_by_dilution() -> None:
+    (fix,) = decode(gga(quality=1))
+    assert (fix.accuracy_m, fix.vertical_accuracy_m, fix.accuracy_source) == (4.0, 8.0, "dop")
+
+
+@pytest.mark.parametrize(("quality", "fixes"), [(0, 0), (1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (6, 0), (7, 0), (8, 0)])
+def test_quality_decides(quality: int, fixes: int) -> None:
+    assert len(decode(gga(quality=quality) + rmc())) == fixes
+
+
+def test_position_without_altitude() -> None:
+    assert [fix.altitude_m for fix in decode(gga(altitude="") + rmc("120001.00"))] == [None, None]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "GPGGA,120000.00,,,,,0,00,99.99,,,,,,",
+        "GPGGA,120000.00,,,,,1,00,99.99,,,,,,",
+        "GPGGA,120000.00,6060.0,N,02454.390,E,1,12,0.8,14.2,M,17.9,M,,",
+        "GPGGA,120000.00,9010.0,N,02454.390,E,1,12,0.8,14.2,M,17.9,M,,",
+        "GPGGA,120000.00,6010.0,X,02454.390,E,1,12,0.8,14.2,M,17.9,M,,",
+        "GPGGA,120000.00,6010.0,N,18100.0,E,1,12,0.8,14.2,M,17.9,M,,",
+        "GPGGA,250000.00,6010.0,N,02454.0,E,1,12,0.8,14.2,M,17.9,M,,",
+        "GPGGA,120000.00,6010.0,N",
+        "GPGGA",
+        "GPGGA,,6010.0,N,02454.0,E,1,12,0.8,14.2,M,17.9,M,,",
+        "GPRMC,120000.00,V,6010.400,N,02454.300,E,0.1,0.0,221126,,,N",
+        "GPRMC,120000.00,A,,,,,0.1,0.0,221126,,,A",
+        "PGGGA,x",
+        "",
+    ],
+)
+def test_nothing_from_sentences_without_a_position(body: str) -> None:
+    assert decode(sentence(body)) == []
+
+
+def test_checksum_is_required() -> None:
+    good = gga()
+    decoder = NmeaDecoder(utc_ns(NOON))
+    decoder.feed(good.replace(b"14.2", b"14.3") + good[: good.index(b"*")] + b"\r\n")
+    assert decoder.flush() == []
+    assert decoder.bad_frames == 2
+    assert decoder.skipped_bytes > 100
+
+
+def test_lower_case_checksum_and_no_line_end() -> None:
+    body = gga().split(b"*")[0][1:].replace(b"14.2", b"15.1")
+    checksum = reduce(xor, body)
+    assert f"{checksum:02x}" != f"{checksum:02X}"
+    assert len(decode(b"$" + body + f"*{checksum:02x}".encode())) == 1
+
+
+def test_cut_sentence_glued_to_a_whole_one() -> None:
+    assert len(decode(gga("115959.00")[:30] + gga())) == 1
+
+
+def test_first_multi_system_gga_wins_then_the_best_quality() -> None:
+    gn, gp_float, gp_fixed = (
+        gga(altitude="1", address="GNGGA"),
+        gga(quality=5, altitude="2"),
+        gga(quality=4, altitude="3"),
+    )
+    assert [fix.altitude_m for fix in decode(gp_float + gp_fixed + gn + gga(altitude="4", address="GNGGA"))] == [1]
+    assert [fix.altitude_m for fix in decode(gp_float + gp_fixed)] == [3]
+    assert [fix.altitude_m for fix in decode(gp_fixed + gp_float)] == [3]
+
+
+def test_learned_end_of_the_cycle_closes_the_epoch() -> None:
+    decoder = NmeaDecoder(utc_ns(NOON))
+    fixes_after = []
+    for second in range(6):
+        time = f"12000{second}.00"
+        cycle = (rmc(time), gga(time), gst(time), sentence("GPVTG,,T,,M,0.025,N,0.045,K,A"))
+        fixes_after.append([len(decoder.feed(part)) for part in cycle])
+    assert fixes_after[:2] == [[0, 0, 0, 0], [1, 0, 0, 0]]
+    assert fixes_after[2] == [1, 0, 1, 0]  # the epoch before and, its end being known now, this one
+    assert fixes_after[3:] == [[0, 0, 1, 0]] * 3
+
+
+def test_wrongly_learned_end_is_given_up() -> None:
+    decoder = NmeaDecoder(utc_ns(NOON))
+    for second in range(4):
+        decoder.feed(gga(f"12000{second}.00"))
+    fixes = []
+    for second in range(4, 9):
+        fixes += decoder.feed(gga(f"12000{second}.00") + gst(f"12000{second}.00"))
+    fixes += decoder.flush()
+    assert [fix.accuracy_source for fix in fixes] == ["dop", "gst", "gst", "gst", "gst"]
+
+
+def test_late_sentences_after_flush_make_no_second_fix() -> None:
+    decoder = NmeaDecoder(utc_ns(NOON))
+    decoder.feed(gga())
+    assert len(decoder.flush()) == 1
+    assert decoder.feed(rmc() + gst()) == []
+    assert decoder.flush() == []
+
+
+@pytest.mark.parametrize(
+    ("stream", "reference", "expected"),
+    [
+        pytest.param(gga("235959.90"), "2026-11-23T00:00:10", "2026-11-22T23:59:59.9", id="undated-before-midnight"),
+        pytest.param(gga("000000.10"), "2026-11-22T23:59:50", "2026-11-23T00:00:00.1", id="undated-after-midnight"),
+        pytest.param(gga() + rmc(), "2026-11-25T00:00:00", NOON, id="rmc-date"),
+        pytest.param(gga() + sentence("GPZDA,120000.00,22,11,2026,00,00"), "2026-11-25T00:00:00", NOON, id="zda-date"),
+        pytest.param(gga() + rmc(date="080407"), NOON, NOON, id="week-rollover"),
+        pytest.param(gga() + rmc(), "1970-01-01T00:00:30", NOON, id="host-clock-not-set"),
+        pytest.param(gga("235960.50"), "2026-11-23T00:00:00", "2026-11-23T00:00:00.5", id="leap-second"),
+        pytest.param(gga("120000"), NOON, NOON, id="time-without-decimals"),
+        pytest.param(gga() + rmc(date="999999"), NOON, NOON, id="impossible-date"),
+    ],
+)
+def test_date(stream: bytes, reference: str, expected: str) -> None:
+    (fix,) = decode(stream, reference)
+    assert fix.device_ticks == utc_ns(expected)
+
+
+def test_midnight_in_the_stream() -> None:
+    stream = b""
+    for time, date in (
+        ("235959.80", "311226"),
+        ("235959.90", "311226"),
+        ("000000.00", "010127"),
+        ("000000.10", "010127"),
+    ):
+        stream += gga(time) + rmc(time, date)
+    ticks = [fix.device_ticks for fix in decode(stream, "2026-12-31T20:00:00")]
+    assert [(later - sooner) // 1_000_000 for sooner, later in pairwise(ticks)] == [100, 100, 100]
+
+
+def test_date_that_comes_after_its_fix_serves_the_next() -> None:
+    decoder = NmeaDecoder(utc_ns("2026-11-25T12:00:00"))
+    fixes = []
+    for second in range(5):
+        time = f"12000{second}.00"
+        fixes += decoder.feed(gga(time))
+        fixes += decoder.flush()
+        fixes += decoder.feed(sentence(f"GPZDA,{time},22,11,2026,00,00"))
+    assert fixes[1].device_ticks == utc_ns("2026-11-22T12:00:01")
+    assert len(fixes) == 5
+
+
+STREAMS = [
+    (DATA / "ublox-zed-f9p.mixed").read_bytes()[:6000],
+    (DATA / "gp-320fw-2019-04-07-coldboot.log").read_bytes()[:6000],
+    (DATA / "nmea-rtk.log").read_bytes()[:4000],
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(STREAMS), st.lists(st.integers(0, 6000), max_size=60))
+def test_any_split_gives_the_same(stream: bytes, cuts: list[int]) -> None:
+    whole, split = NmeaDecoder(utc_ns("2020-01-01")), NmeaDecoder(utc_ns("2020-01-01"))
+    expected = whole.feed(stream)
+    edges = [0, *sorted(cuts), len(stream)]
+    fixes = [fix for start, end in pairwise(edges) for fix in split.feed(stream[start:end])]
+    assert fixes == expected
+    assert (split.bad_frames, split.skipped_bytes) == (whole.bad_frames, whole.skipped_bytes)
+
+
+def test_byte_by_byte() -> None:
+    for stream in STREAMS:
+        decoder = NmeaDecoder(utc_ns("2020-01-01"))
+        fixes = [fix for byte in stream for fix in decoder.feed(bytes((byte,)))]
+        assert fixes == NmeaDecoder(utc_ns("2020-01-01")).feed(stream)
+
+
+pieces = st.one_of(
+    st.binary(max_size=300),
+    st.sampled_from(
+        [b"$", b"$GPGGA,", b"*", b"\xb5b", b"\xd3\x00", b"\xd3\x03\xff", b"\xb5b\x01\x07\x00\x10", gga(), rmc()]
+    ),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(pieces, max_size=20))
+@example([b"$" * 5000])
+@example([b"$" + b"1" * 5000])
+def test_garbage_neither_raises_nor_grows_nor_hides_what_follows(garbage: list[bytes]) -> None:
+    decoder = NmeaDecoder(utc_ns(NOON))
+    for piece in garbage:
+        decoder.feed(piece)
+        assert len(decoder._scanner._buffer) <= MAX_UBX_PAYLOAD_BYTES + 8
+    decoder.flush()
+    # A false header of a binary message may hold what follows back, but not for longer than such a message is.
+    good = gga("130000.00") * (1 + (MAX_UBX_PAYLOAD_BYTES + MAX_SENTENCE_BYTES) // len(gga()))
+    fixes = decoder.feed(good) + decoder.flush()
+    assert [fix.device_ticks for fix in fixes][-1:] == [utc_ns("2026-11-22T13:00:00")]
