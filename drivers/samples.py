@@ -122,7 +122,7 @@ class ScanSample:
     points: (n,) POINT_DTYPE, `timestamp` in seconds on the lidar's clock.
     first_ticks, last_ticks: device time of the first and last packet present.
     packets_expected counts what the device sends for one frame, packets_received what came, duplicates apart.
-    is_partial: the stream began inside this frame.
+    is_partial: the stream began inside this frame. model: name of the point format in the recording.
     """
 
     points: npt.NDArray[np.void]
@@ -132,6 +132,7 @@ class ScanSample:
     packets_received: int
     duplicates: int
     is_partial: bool
+    model: str = "RoboSense M1 XYZIRT"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

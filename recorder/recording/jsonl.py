@@ -8,20 +8,18 @@ Key names are those of the data format; extra keys, which its readers ignore: `f
 within `lidar`.
 """
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from drivers.samples import FixSample, ImuSample, PoseSample, ScanSample
-from recorder.recording.manifest import NS_PER_S, sync_folder
-from recorder.recording.work import ByteQueue, Ticket, start_thread
+from recorder.recording.manifest import NS_PER_S, FileEntry, sync_folder
+from recorder.recording.work import ByteQueue, HashedFile, Ticket, start_thread
 
 DATA_NAME = "data.jsonl"
 LATE_NAME = "late.jsonl"
@@ -159,8 +157,8 @@ class LineWriter:
         self.written_lines = 0
         self.frames_written = 0
         self._folder = folder
-        self._file = (folder / DATA_NAME).open("xb")
-        self._late_file: BufferedWriter | None = None
+        self._file = HashedFile(folder / DATA_NAME)
+        self._late_file: HashedFile | None = None
         self._queue: ByteQueue[tuple[Pending, bool]] = ByteQueue(QUEUE_BYTES)
         self._on_error = on_error
         self._thread = start_thread("jsonl", self._run, self._failed)
@@ -177,7 +175,7 @@ class LineWriter:
             self._write_ready(waiting)
             self._file.flush()
             if time.monotonic() - last_sync_s >= SYNC_S:
-                os.fdatasync(self._file.fileno())
+                self._file.sync()
                 last_sync_s = time.monotonic()
             time.sleep(FLUSH_S / 2)  # collects lines: one write for many
 
@@ -215,22 +213,20 @@ class LineWriter:
         while not self._queue.ended:
             self._queue.get_all(FLUSH_S)
 
-    def _open_late_file(self) -> BufferedWriter:
+    def _open_late_file(self) -> HashedFile:
         if self._late_file is None:
-            self._late_file = (self._folder / LATE_NAME).open("xb")
+            self._late_file = HashedFile(self._folder / LATE_NAME)
         return self._late_file
 
-    def close(self) -> None:
-        """Write what is left, merge late lines in, make all of it durable."""
+    def close(self) -> dict[str, FileEntry]:
+        """Write what is left, merge late lines in, make all of it durable; gives size and hash."""
         self._queue.close()
         self._thread.join()
-        for file in (self._late_file, self._file):
-            if file is not None:
-                file.flush()
-                os.fsync(file.fileno())
-                file.close()
+        entry = self._file.close()
         if self._late_file is not None:
-            merge_late_lines(self._folder)
+            self._late_file.close()
+            entry = merge_late_lines(self._folder)
+        return {DATA_NAME: entry}
 
 
 def _is_ready(pending: Pending) -> bool:
@@ -239,7 +235,7 @@ def _is_ready(pending: Pending) -> bool:
     return not isinstance(pending, PendingScan) or pending.ticket.state != "pending"
 
 
-def merge_late_lines(folder: Path) -> None:
+def merge_late_lines(folder: Path) -> FileEntry:
     """Merge late.jsonl into data.jsonl by time; a late picture joins the line of its instant; frames are renumbered.
 
     Memory holds the late lines only. data.jsonl is replaced whole, then late.jsonl removed.
@@ -247,18 +243,18 @@ def merge_late_lines(folder: Path) -> None:
     late_path, data_path = folder / LATE_NAME, folder / DATA_NAME
     late = sorted(_decoded_lines(late_path), key=lambda entry: entry[0])
     merged_path = folder / (DATA_NAME + ".tmp")
-    with merged_path.open("wb") as merged:
-        number = 0
-        for line in _joined(_merged(_decoded_lines(data_path), iter(late))):
-            if "frames" in line:
-                line["number"] = number
-                number += 1
-            merged.write(encode_json(line) + b"\n")
-        merged.flush()
-        os.fsync(merged.fileno())
+    merged = HashedFile(merged_path)
+    number = 0
+    for line in _joined(_merged(_decoded_lines(data_path), iter(late))):
+        if "frames" in line:
+            line["number"] = number
+            number += 1
+        merged.write(encode_json(line) + b"\n")
+    entry = merged.close()
     merged_path.replace(data_path)
     late_path.unlink()
     sync_folder(folder)
+    return entry
 
 
 def _decoded_lines(path: Path) -> Iterator[tuple[float, dict[str, Any]]]:

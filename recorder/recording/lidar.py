@@ -4,6 +4,7 @@ A file is written under a temporary name, made durable and renamed; only then it
 written.
 """
 
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from recorder.recording.manifest import sync_folder
+from recorder.recording.manifest import FileEntry, sync_folder
 from recorder.recording.work import ByteQueue, Ticket, start_thread
 
 FOLDER = "lidar"
@@ -32,6 +33,7 @@ class ScanWriter:
         self._folder = folder
         (folder / FOLDER).mkdir()
         self._count = 0
+        self._entries: dict[str, FileEntry] = {}
         self._on_error = on_error
         self._queue: ByteQueue[tuple[str, npt.NDArray[np.void], Ticket]] = ByteQueue(QUEUE_BYTES)
         self._thread = start_thread("lidar", self._run, self._failed)
@@ -49,6 +51,7 @@ class ScanWriter:
         while not self._queue.ended:
             for name, points, ticket in self._queue.get_all(0.5):
                 self._write(self._folder / name, points)
+                self._entries[name] = FileEntry(points.nbytes, hashlib.sha256(points.data).hexdigest())
                 ticket.state = "done"
                 written += 1
                 if written % SYNC_SCANS == 0:
@@ -68,8 +71,9 @@ class ScanWriter:
             for _, _, ticket in self._queue.get_all(0.5):
                 ticket.state = "failed"
 
-    def close(self) -> None:
-        """Write what is left."""
+    def close(self) -> dict[str, FileEntry]:
+        """Write what is left; gives size and hash of each file."""
         self._queue.close()
         self._thread.join()
         sync_folder(self._folder / FOLDER)
+        return self._entries

@@ -128,15 +128,11 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def file_entries(folder: Path) -> dict[str, FileEntry]:
-    """Size and SHA-256 of all files of a recording but the manifest itself, by relative path."""
-    entries = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.name != MANIFEST_NAME:
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            entries[path.relative_to(folder).as_posix()] = FileEntry(path.stat().st_size, digest)
-    return entries
+def hash_file(path: Path) -> FileEntry:
+    """Size and SHA-256 of a file."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return FileEntry(path.stat().st_size, digest)
 
 
 class EventLog:

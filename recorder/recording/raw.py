@@ -9,18 +9,17 @@ raw/DEVICE.clock holds the pairs that the clock map was fed: little-endian int64
 ns), 16 bytes a pair.
 """
 
-import os
 import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.samples import Chunk
-from recorder.recording.work import ByteQueue, start_thread
+from recorder.recording.manifest import FileEntry
+from recorder.recording.work import ByteQueue, HashedFile, start_thread
 
 FOLDER = "raw"
 QUEUE_BYTES = 64 << 20
@@ -40,7 +39,7 @@ class TapeFile:
 
     def __init__(self, path: Path, *, is_serial: bool, utc_minus_monotonic_ns: int) -> None:
         """Create the file with its section and interface headers; it must not exist."""
-        self.file = path.open("xb", buffering=1 << 20)
+        self.file = HashedFile(path, 1 << 20)
         self._is_serial = is_serial
         self._offset_ns = utc_minus_monotonic_ns
         self._ip_headers: dict[tuple[object, ...], bytes] = {}
@@ -119,7 +118,7 @@ class RawWriter:
         self._offset_ns = utc_minus_monotonic_ns
         self._tape = tape
         self._tapes: dict[str, TapeFile] = {}
-        self._pair_files: dict[str, BinaryIO] = {}
+        self._pair_files: dict[str, HashedFile] = {}
         self._queue: ByteQueue[tuple[str, tuple[Chunk, ...] | bytes]] = ByteQueue(QUEUE_BYTES)
         self._on_error = on_error
         self._thread = start_thread("raw", self._run, self._failed)
@@ -148,16 +147,17 @@ class RawWriter:
                     tape = self._tape_file(device, item[0])
                     for chunk in item:
                         tape.write(chunk)
-            for file in self._files():
+            for file in self._files().values():
                 file.flush()
             if time.monotonic() - last_sync_s >= SYNC_S:
-                for file in self._files():
-                    os.fdatasync(file.fileno())
+                for file in self._files().values():
+                    file.sync()
                 last_sync_s = time.monotonic()
             time.sleep(0.02)  # collects chunks: few large writes
 
-    def _files(self) -> list[BinaryIO]:
-        return [tape.file for tape in self._tapes.values()] + list(self._pair_files.values())
+    def _files(self) -> dict[str, HashedFile]:
+        tapes = {f"{FOLDER}/{device}.pcapng": tape.file for device, tape in self._tapes.items()}
+        return tapes | {f"{FOLDER}/{device}.clock": file for device, file in self._pair_files.items()}
 
     def _tape_file(self, device: str, first: Chunk) -> TapeFile:
         if device not in self._tapes:
@@ -166,9 +166,9 @@ class RawWriter:
             self._tapes[device] = TapeFile(path, is_serial=is_serial, utc_minus_monotonic_ns=self._offset_ns)
         return self._tapes[device]
 
-    def _pair_file(self, device: str) -> BinaryIO:
+    def _pair_file(self, device: str) -> HashedFile:
         if device not in self._pair_files:
-            self._pair_files[device] = (self._folder / f"{device}.clock").open("xb", buffering=1 << 16)
+            self._pair_files[device] = HashedFile(self._folder / f"{device}.clock")
         return self._pair_files[device]
 
     def _failed(self, name: str, error: Exception) -> None:
@@ -176,11 +176,8 @@ class RawWriter:
         while not self._queue.ended:
             self._queue.get_all(0.5)
 
-    def close(self) -> None:
-        """Write what is left, durably."""
+    def close(self) -> dict[str, FileEntry]:
+        """Write what is left, durably; gives size and hash of each file."""
         self._queue.close()
         self._thread.join()
-        for file in self._files():
-            file.flush()
-            os.fsync(file.fileno())
-            file.close()
+        return {name: file.close() for name, file in self._files().items()}

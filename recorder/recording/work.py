@@ -4,10 +4,15 @@ A line of data.jsonl that names a picture or a file may be written only when tha
 picture or file says so through the line's ticket.
 """
 
+import hashlib
+import os
 import threading
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Generic, TypeVar
+
+from recorder.recording.manifest import FileEntry
 
 T = TypeVar("T")
 
@@ -83,6 +88,37 @@ class ByteQueue(Generic[T]):
         """Closed and empty."""
         with self._changed:
             return self._closed and not self._items
+
+
+class HashedFile:
+    """A new file written from front to end, hashed on the way (a recording can be too large to read again)."""
+
+    def __init__(self, path: Path, buffer_bytes: int = 1 << 17) -> None:
+        """Create the file; it must not exist."""
+        self._file = path.open("xb", buffering=buffer_bytes)
+        self._hash = hashlib.sha256()
+        self._size = 0
+
+    def write(self, data: bytes) -> None:
+        """Append bytes."""
+        self._file.write(data)
+        self._hash.update(data)
+        self._size += len(data)
+
+    def flush(self) -> None:
+        """Hand what is buffered to the system: it survives SIGKILL."""
+        self._file.flush()
+
+    def sync(self) -> None:
+        """Make what was flushed survive power loss."""
+        os.fdatasync(self._file.fileno())
+
+    def close(self) -> FileEntry:
+        """Close durably; gives size and hash."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        return FileEntry(self._size, self._hash.hexdigest())
 
 
 def start_thread(name: str, body: Callable[[], None], on_error: Callable[[str, Exception], None]) -> threading.Thread:

@@ -1,0 +1,190 @@
+"""From samples to the recording: the single-threaded heart of a take.
+
+    sample (device time) -> Timebase -> recording time -> Synchronizer -> RecordingWriter
+                            clock maps                    pair, order     files
+
+`take` is called with every sample in order of arrival, `advance` every few milliseconds, `finish` once.
+"""
+
+from dataclasses import dataclass
+
+from drivers.device import DeviceConfig
+from drivers.samples import (
+    ClockPairs,
+    FixSample,
+    FrameSample,
+    ImuSample,
+    LostFrame,
+    PoseSample,
+    Sample,
+    ScanSample,
+)
+from recorder.clock import ClockMap
+from recorder.recording.manifest import NS_PER_S, ClockSummary, StreamSummary
+from recorder.recording.writer import RecordingWriter
+from recorder.synchronizer import FrameSet, Released, Synchronizer
+from recorder.timebase import HOLD_AT_START_NS, Stamped, Timebase
+
+WINDOW_NS = 500_000_000
+PAIRS_EVERY_NS = 500_000_000
+
+
+@dataclass(slots=True)
+class DeviceInTake:
+    """What the pipeline must know of one device, and its counts.
+
+    camera: index of its video, None for other devices. last_host_ns: time of its newest stamped sample.
+    """
+
+    name: str
+    config: DeviceConfig
+    clock: str
+    tick_hz: float
+    wrap_bits: int
+    camera: int | None
+    summary: StreamSummary
+    last_host_ns: int = 0
+    wait_for_keyframe: bool = True
+    last_picture_ns: int = -1
+
+
+class Pipeline:
+    """Takes samples of all devices and writes them in their order."""
+
+    def __init__(
+        self, writer: RecordingWriter, devices: list[DeviceInTake], start_ns: int, pair_within_ns: int
+    ) -> None:
+        """start_ns: host time of recording time 0."""
+        self._writer = writer
+        self._start_ns = start_ns
+        self._devices = {device.name: device for device in devices}
+        self._timebase = Timebase(start_ns)
+        for device in devices:
+            latency_ns = round(device.config.latency_s * NS_PER_S)
+            self._timebase.add_device(device.name, device.clock, device.tick_hz, device.wrap_bits, latency_ns)
+        cameras = sum(device.camera is not None for device in devices)
+        self._synchronizer: Synchronizer[Stamped, FrameSample] = Synchronizer(cameras, pair_within_ns)
+        self._last_pairs_ns = start_ns
+
+    def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
+        """Feed one sample with its arrival on the host's monotonic clock."""
+        summary = self._devices[device].summary
+        if isinstance(sample, LostFrame):
+            summary.dropped += 1
+        elif not isinstance(sample, ClockPairs):
+            summary.received += 1
+        for stamped in self._timebase.take(device, arrival_ns, sample):
+            self._place(stamped)
+
+    def _place(self, stamped: Stamped) -> None:
+        device = self._devices[stamped.device]
+        device.last_host_ns = stamped.host_ns
+        time_ns = stamped.host_ns - self._start_ns
+        if isinstance(stamped.sample, FrameSample | LostFrame):
+            self._place_picture(device, time_ns, stamped.device_ns, stamped.sample)
+        elif time_ns < 0:
+            device.summary.before_start += 1
+        else:
+            self._synchronizer.add(time_ns, stamped)
+
+    def _place_picture(
+        self, device: DeviceInTake, time_ns: int, device_ns: int, sample: FrameSample | LostFrame
+    ) -> None:
+        """A video begins with a key frame at or after time 0 and its pictures have ascending times.
+
+        A picture that must be left out takes those after it along, up to the next key frame.
+        """
+        assert device.camera is not None
+        has_begun = device.last_picture_ns >= 0
+        if isinstance(sample, FrameSample):
+            usable = time_ns > device.last_picture_ns and (sample.is_keyframe or not device.wait_for_keyframe)
+            device.wait_for_keyframe = not usable
+            if usable:
+                device.last_picture_ns = time_ns
+                self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
+                return
+            if has_begun:
+                device.summary.dropped += 1
+            else:
+                device.summary.before_start += 1
+        else:
+            device.wait_for_keyframe = True
+        if has_begun and time_ns > device.last_picture_ns:
+            self._synchronizer.add_picture(device.camera, device_ns, time_ns, None)
+
+    def advance(self, now_ns: int) -> None:
+        """Write what is old enough that nothing earlier is to be expected."""
+        for stamped in self._timebase.release(now_ns):
+            self._place(stamped)
+        for clock, epoch in self._timebase.epochs_begun():
+            text = f"clock {clock} began sync epoch {epoch}: its device restarted, paused or jumped in time"
+            self._writer.events.write(clock, "epoch", text)
+        if now_ns - self._start_ns > HOLD_AT_START_NS + WINDOW_NS // 5:
+            self._write(self._synchronizer.release(now_ns - WINDOW_NS - self._start_ns))
+        if now_ns - self._last_pairs_ns >= PAIRS_EVERY_NS:
+            self._last_pairs_ns = now_ns
+            self._write_pairs()
+
+    def finish(self) -> None:
+        """Write all that is left."""
+        for stamped in self._timebase.flush():
+            self._place(stamped)
+        self._write(self._synchronizer.flush())
+        self._write_pairs()
+
+    def _write_pairs(self) -> None:
+        for device, pairs in self._timebase.take_pairs().items():
+            self._writer.raw.put_pairs(device, pairs)
+
+    def _write(self, released: list[Released[Stamped, FrameSample]]) -> None:
+        for entry in released:
+            if isinstance(entry.item, FrameSet):
+                self._writer.write_frames(entry.time_ns, entry.item.pictures, late=entry.late)
+                self._count_late_pictures(entry)
+            else:
+                summary = self._devices[entry.item.device].summary
+                summary.late += entry.late
+                if self._write_sample(entry.time_ns, entry.item, late=entry.late):
+                    summary.written += 1
+                else:
+                    summary.incomplete += 1
+
+    def _count_late_pictures(self, entry: Released[Stamped, FrameSample]) -> None:
+        assert isinstance(entry.item, FrameSet)
+        for device in self._devices.values():
+            if entry.late and device.camera is not None and entry.item.pictures[device.camera] is not None:
+                device.summary.late += 1
+
+    def _write_sample(self, time_ns: int, stamped: Stamped, *, late: bool) -> bool:
+        sample = stamped.sample
+        config = self._devices[stamped.device].config
+        if isinstance(sample, ImuSample):
+            self._writer.write_imu(time_ns, sample, late=late)
+        elif isinstance(sample, FixSample):
+            return self._writer.write_fix(time_ns, sample, late=late)
+        elif isinstance(sample, PoseSample):
+            self._writer.write_pose(time_ns, getattr(config, "name", stamped.device), sample, late=late)
+        elif isinstance(sample, ScanSample):
+            if stamped.point_host_ns is None:
+                return False
+            point_time_ns = stamped.point_host_ns - self._start_ns
+            self._writer.write_scan(time_ns, sample.model, sample, point_time_ns, late=late)
+        return True
+
+    def clock_summaries(self) -> dict[str, ClockSummary]:
+        """Each clock as its map sees it now."""
+        ticks = {device.clock: (device.tick_hz, device.wrap_bits) for device in reversed(list(self._devices.values()))}
+        return {name: _clock_summary(clock, *ticks[name]) for name, clock in self._timebase.clocks().items()}
+
+
+def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int) -> ClockSummary:
+    return ClockSummary(
+        tick_hz=tick_hz,
+        wrap_bits=wrap_bits,
+        epochs=clock.epoch + 1,
+        skew_ppm=round(clock.skew_ppm, 4),
+        uncertainty_us=round(clock.uncertainty_ns / 1e3, 3),
+        duplicates=clock.duplicates,
+        resets=clock.resets,
+        wraps=clock.wraps,
+    )

@@ -1,0 +1,181 @@
+"""Writes one recording: takes samples in time order and puts them into the files of the Spectacular AI format.
+
+    write_*  ->  data.jsonl (LineWriter)  data.mkv ... (VideoWriter)  lidar/ (ScanWriter)  raw/  events.jsonl
+
+Times are nanoseconds of recording time. Not thread safe but for `event` and `raw`: one thread calls it.
+"""
+
+import platform
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+
+from drivers.samples import FixSample, FrameSample, ImuSample, PoseSample, ScanSample
+from recorder.recording.jsonl import (
+    LineWriter,
+    PendingFrames,
+    PendingPicture,
+    PendingScan,
+    fix_line,
+    imu_lines,
+    lidar_line,
+    pose_line,
+)
+from recorder.recording.lidar import ScanWriter
+from recorder.recording.manifest import (
+    EVENTS_NAME,
+    NS_PER_S,
+    ClockSummary,
+    DeviceSummary,
+    EventLog,
+    FileEntry,
+    Manifest,
+    UtcAtZero,
+    hash_file,
+    write_atomically,
+    write_manifest,
+)
+from recorder.recording.raw import RawWriter
+from recorder.recording.video import VideoWriter, video_name
+from recorder.recording.work import Ticket
+
+CALIBRATION_NAME = "calibration.json"
+OnError = Callable[[str, Exception], None]
+
+
+class RecordingWriter:
+    """One recording being written.
+
+    manifest: kept up to date by the caller (`devices`, `clocks`); written at the start and at the end.
+    on_error: told of an error in a writer thread; the recording must then be closed.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        manifest: Manifest,
+        *,
+        calibration: bytes | None,
+        lidar: bool,
+        raw: bool,
+        on_error: OnError,
+    ) -> None:
+        """Create all files in an existing, empty folder."""
+        self.folder = folder
+        self.manifest = manifest
+        start_ns = manifest.start_monotonic_ns
+        write_manifest(folder, manifest)
+        if calibration is not None:
+            write_atomically(folder / CALIBRATION_NAME, calibration)
+        self.events = EventLog(folder / EVENTS_NAME, start_ns)
+        self.raw = RawWriter(folder, manifest.utc_at_time_0.utc_ns - start_ns, on_error, tape=raw)
+        self._lines = LineWriter(folder, on_error)
+        self._scans = ScanWriter(folder, on_error) if lidar else None
+        self.videos = [
+            VideoWriter(folder / video_name(index), on_error, self._refused(camera))
+            for index, camera in enumerate(manifest.cameras)
+        ]
+
+    def _refused(self, camera: str) -> Callable[[str], None]:
+        return lambda text: self.events.write(camera, "drop", text)
+
+    def write_imu(self, time_ns: int, sample: ImuSample, *, late: bool = False) -> None:
+        """One line per sensor of the sample."""
+        for line in imu_lines(time_ns, sample):
+            self._lines.put(line, late=late)
+
+    def write_fix(self, time_ns: int, fix: FixSample, *, late: bool = False) -> bool:
+        """A gps line; False when the fix lacks what the format needs."""
+        line = fix_line(time_ns, fix)
+        if line is None:
+            return False
+        self._lines.put(line, late=late)
+        return True
+
+    def write_pose(self, time_ns: int, name: str, pose: PoseSample, *, late: bool = False) -> None:
+        """A line with the pose under its name."""
+        self._lines.put(pose_line(time_ns, name, pose), late=late)
+
+    def write_scan(
+        self,
+        time_ns: int,
+        model: str,
+        scan: ScanSample,
+        point_time_ns: npt.NDArray[np.int64],
+        *,
+        late: bool = False,
+    ) -> None:
+        """A file of points, stamped in recording time, and its line."""
+        assert self._scans is not None
+        points = scan.points.copy()
+        points["timestamp"] = point_time_ns / NS_PER_S
+        name, ticket = self._scans.put(points)
+        self._lines.put(PendingScan(ticket, lidar_line(time_ns, model, name, scan)), late=late)
+
+    def write_frames(self, time_ns: int, pictures: Sequence[FrameSample | None], *, late: bool = False) -> None:
+        """A frame set: one picture per camera, None where it is not there."""
+        pending = []
+        for video, picture in zip(self.videos, pictures, strict=True):
+            ticket: Ticket | None = video.put(time_ns, picture) if picture is not None else None
+            pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None))
+        self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
+
+    def close(self, duration_ns: int, stopped_by: str, *, complete: bool = True) -> None:
+        """Finish all files; recording.json says complete last of all."""
+        files: dict[str, FileEntry] = {}
+        for video in self.videos:
+            video.close()
+        if self._scans is not None:
+            files |= self._scans.close()
+        files |= self._lines.close()
+        files |= self.raw.close()
+        self.events.close()
+        for index in range(len(self.videos)):
+            if self.videos[index].pictures:
+                files[video_name(index)] = hash_file(self.folder / video_name(index))
+        for name in (CALIBRATION_NAME, EVENTS_NAME):
+            if (self.folder / name).exists():
+                files[name] = hash_file(self.folder / name)
+        self.manifest.files = dict(sorted(files.items()))
+        self.manifest.duration_s = duration_ns / NS_PER_S
+        self.manifest.stopped_by = stopped_by
+        self.manifest.state = "complete" if complete else "recording"
+        write_manifest(self.folder, self.manifest)
+
+
+def new_manifest(
+    name: str,
+    *,
+    start_monotonic_ns: int,
+    utc_ns: int,
+    utc_source: str,
+    cameras: list[str],
+    devices: dict[str, DeviceSummary],
+    clocks: dict[str, ClockSummary],
+    rig: dict[str, Any],
+) -> Manifest:
+    """The manifest of a recording that begins now, with versions and host filled in."""
+    return Manifest(
+        state="recording",
+        name=name,
+        started_utc=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(utc_ns // NS_PER_S)),
+        start_monotonic_ns=start_monotonic_ns,
+        utc_at_time_0=UtcAtZero(utc_ns, utc_source),
+        cameras=cameras,
+        devices=devices,
+        clocks=clocks,
+        rig=rig,
+        versions={
+            "rigtape": version("rigtape"),
+            "python": platform.python_version(),
+            "av": av.__version__,
+            "numpy": np.__version__,
+        },
+        host={"system": platform.platform(), "machine": platform.machine(), "name": platform.node()},
+    )

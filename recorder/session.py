@@ -1,0 +1,385 @@
+"""One take, from start to stop.
+
+    device thread per device:  driver.read ──▶ raw tape
+                                   │
+                                   ▼ inbox (bounded by bytes; a drop is counted, never silent)
+    merge thread:              Pipeline: clock maps ──▶ synchronizer ──▶ recording writer ──▶ writer threads
+    calling thread:            watches the disk and the clock, shows the status, stops
+
+A device that is lost is taken up again by its own thread; an error of a writer ends the take, with everything closed.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+
+from calibration.model import Calibration, CalibrationError, dump, load_calibration, validate
+from drivers.device import DeviceError, Driver, received
+from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, Sample, ScanSample
+from recorder.errors import ConfigError, RecorderError
+from recorder.pipeline import DeviceInTake, Pipeline
+from recorder.recording.folder import check_output, create_take_folder, free_bytes, low_water_bytes
+from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, StreamSummary
+from recorder.recording.work import ByteQueue
+from recorder.recording.writer import RecordingWriter, new_manifest
+from recorder.rig import Rig, RigDevice
+
+log = logging.getLogger(__name__)
+
+INBOX_BYTES = 256 << 20
+SAMPLE_BYTES = 300
+MERGE_EVERY_S = 0.02
+STATUS_EVERY_S = 0.5
+
+
+class DevicesMissingError(RecorderError):
+    """Required devices that cannot be used: one line for each, with what was tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceStatus:
+    """One line of the live status. lag_s: age of the newest sample, None before the first."""
+
+    name: str
+    kind: str
+    rate_hz: float
+    received: int
+    lost: int
+    dropped: int
+    lag_s: float | None
+    is_connected: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TakeStatus:
+    """What the status line shows."""
+
+    folder: Path
+    elapsed_s: float
+    devices: list[DeviceStatus]
+    disk_free_bytes: int
+    disk_left_s: float
+
+
+OnStatus = Callable[[TakeStatus], None]
+OnEvent = Callable[[str, DeviceEvent], None]
+
+
+def record(
+    rig: Rig,
+    out: Path,
+    *,
+    name: str | None,
+    duration_s: float | None,
+    stop: threading.Event,
+    on_status: OnStatus,
+    on_event: OnEvent,
+) -> tuple[Path, Manifest]:
+    """Record one take of a rig until `stop` is set, the duration is over or the disk is low.
+
+    Gives the folder and its manifest. Raises RecorderError before anything was recorded: a bad calibration, an output
+    that can't hold a minute, required devices that are missing.
+    """
+    drivers = {device.name: device.driver.create(device.name, device.config) for device in rig.devices}
+    calibration = _calibration(rig, _cameras(rig, drivers))
+    bytes_per_s = sum(stream.bytes_per_s for driver in drivers.values() for stream in driver.streams)
+    check_output(out, bytes_per_s)
+    connected = _connect(rig, drivers, stop, on_event)
+    try:
+        folder = create_take_folder(out, name, time.time_ns())
+        take = Take(rig, drivers, connected, folder, calibration, bytes_per_s, on_event)
+    except BaseException:
+        for driver in drivers.values():
+            driver.close()
+        raise
+    return folder, take.run(duration_s, stop, on_status)
+
+
+def _cameras(rig: Rig, drivers: dict[str, Driver]) -> list[RigDevice]:
+    """Camera devices in the order of their index. All must be on one clock, as they make one frame set."""
+    cameras = [device for device in rig.devices if drivers[device.name].streams[0].kind == "frames"]
+    if len({camera.clock for camera in cameras}) > 1:
+        clocks = ", ".join(f"{camera.name} on {camera.clock}" for camera in cameras)
+        raise ConfigError(
+            f"cameras can be recorded together only when one clock stamps them ({clocks}); "
+            "give synchronised cameras the same `clock: NAME`"
+        )
+    return cameras
+
+
+def _calibration(rig: Rig, cameras: list[RigDevice]) -> bytes | None:
+    if rig.calibration is None:
+        return None
+    try:
+        calibration = load_calibration(rig.calibration)
+    except CalibrationError as error:
+        raise ConfigError(str(error)) from error
+    faults = validate(calibration) + _too_few(calibration, cameras)
+    if faults:
+        raise ConfigError("\n".join(f"{rig.calibration}: {fault}" for fault in faults))
+    return dump(calibration)
+
+
+def _too_few(calibration: Calibration, cameras: list[RigDevice]) -> list[str]:
+    if len(calibration.cameras) >= len(cameras):
+        return []
+    names = ", ".join(camera.name for camera in cameras)
+    return [f"has {len(calibration.cameras)} cameras, the rig has {len(cameras)} ({names})"]
+
+
+def _connect(rig: Rig, drivers: dict[str, Driver], stop: threading.Event, on_event: OnEvent) -> set[str]:
+    """Open all devices at once. Gives those that answered; raises when a required one did not."""
+
+    def attempt(device: RigDevice) -> str | None:
+        try:
+            drivers[device.name].connect()
+        except DeviceError as error:
+            return str(error)
+        return None
+
+    with ThreadPoolExecutor(max_workers=len(rig.devices)) as pool:
+        faults = dict(zip((device.name for device in rig.devices), pool.map(attempt, rig.devices), strict=True))
+    missing = [device for device in rig.devices if faults[device.name] is not None]
+    required = [f"device {device.name}: {faults[device.name]}" for device in missing if device.config.required]
+    if required or stop.is_set():
+        for driver in drivers.values():
+            driver.close()
+    if required:
+        raise DevicesMissingError("\n".join(required) + "\n(a device with `required: false` may come later)")
+    if stop.is_set():
+        raise RecorderError("stopped before the take began; nothing was recorded")
+    for device in missing:
+        on_event(device.name, DeviceEvent("warning", f"not there yet: {faults[device.name]}"))
+    return {device.name for device in rig.devices} - {device.name for device in missing}
+
+
+class Take:
+    """One running take: its threads, its counters, its end."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        drivers: dict[str, Driver],
+        connected: set[str],
+        folder: Path,
+        calibration: bytes | None,
+        bytes_per_s: float,
+        on_event: OnEvent,
+    ) -> None:
+        """Time 0 is now: the files are created, and the devices are read from `run` on."""
+        self._drivers = drivers
+        self._connected = set(connected)
+        self._bytes_per_s = bytes_per_s
+        self._on_event = on_event
+        self._stop_reading = threading.Event()
+        self._failure: str | None = None
+        self._inbox: ByteQueue[tuple[str, Received]] = ByteQueue(INBOX_BYTES)
+        self._start_ns = time.monotonic_ns()
+        cameras = _cameras(rig, drivers)
+        self._devices = {device.name: _in_take(device, drivers[device.name], cameras) for device in rig.devices}
+        self._manifest = self._new_manifest(rig, folder.name, [camera.name for camera in cameras])
+        self._writer = RecordingWriter(
+            folder,
+            self._manifest,
+            calibration=calibration,
+            lidar=any(device.summary.kind == "lidar" for device in self._devices.values()),
+            raw=rig.raw,
+            on_error=self._writer_failed,
+        )
+        self._pipeline = Pipeline(
+            self._writer, list(self._devices.values()), self._start_ns, _half_period_ns(cameras, drivers)
+        )
+        self._folder = folder
+        self._last_counts: dict[str, int] = {}
+        self._last_status_s = time.monotonic()
+
+    def _new_manifest(self, rig: Rig, name: str, cameras: list[str]) -> Manifest:
+        return new_manifest(
+            name,
+            start_monotonic_ns=self._start_ns,
+            utc_ns=time.time_ns() - (time.monotonic_ns() - self._start_ns),
+            utc_source="host clock",
+            cameras=cameras,
+            devices={device.name: self._device_summary(device) for device in rig.devices},
+            clocks={},
+            rig=rig.source,
+        )
+
+    def _device_summary(self, device: RigDevice) -> DeviceSummary:
+        return DeviceSummary(
+            driver=device.config.driver,
+            clock=device.clock,
+            latency_s=device.config.latency_s,
+            identity=self._drivers[device.name].identity,
+            stream=self._devices[device.name].summary,
+        )
+
+    # -- threads --
+
+    def run(self, duration_s: float | None, stop: threading.Event, on_status: OnStatus) -> Manifest:
+        """Record until stopped; closes everything and gives the manifest as written."""
+        readers = [
+            threading.Thread(target=self._guard, args=(name, self._read_device, name), name=name, daemon=True)
+            for name in self._devices
+        ]
+        merger = threading.Thread(target=self._guard, args=("merge", self._merge), name="merge", daemon=True)
+        for thread in (*readers, merger):
+            thread.start()
+        stopped_by = self._watch(duration_s, stop, on_status)
+        end_ns = time.monotonic_ns()
+        self._stop_reading.set()
+        for thread in readers:
+            thread.join()
+        self._inbox.close()
+        merger.join()
+        return self._finish(end_ns, stopped_by)
+
+    def _guard(self, name: str, body: Callable[..., None], *arguments: str) -> None:
+        try:
+            body(*arguments)
+        except Exception as error:  # the top of a thread: the take must end loudly
+            log.exception("thread %s failed", name)
+            self._fail(f"{name}: {type(error).__name__}: {error}")
+
+    def _writer_failed(self, name: str, error: Exception) -> None:
+        self._fail(f"{name}: {error}")
+
+    def _fail(self, text: str) -> None:
+        if self._failure is None:
+            self._failure = text
+
+    def _read_device(self, name: str) -> None:
+        """Hand over all that a device sends until the take stops."""
+        drop_began = False
+        for item in received(self._drivers[name], self._stop_reading, connected=name in self._connected):
+            self._writer.raw.put_chunks(name, item.chunks)
+            for event in item.events:
+                self._note(name, event)
+            if not item.samples:
+                continue
+            if self._inbox.offer((name, item), _size(item)):
+                drop_began = False
+                continue
+            kept, lost = _without_payload(item)
+            self._devices[name].summary.dropped += lost
+            if not drop_began:
+                self._note(name, DeviceEvent("drop", "the recorder is too slow: samples are dropped", lost))
+            drop_began = True
+            self._inbox.offer((name, kept), 0)
+
+    def _note(self, name: str, event: DeviceEvent) -> None:
+        """Write an event down, count what it says was lost, and tell the user."""
+        summary = self._devices[name].summary
+        if event.kind == "gap":
+            summary.lost += event.count
+        elif event.kind == "drop":
+            summary.dropped += event.count
+        elif event.kind == "connected":
+            self._connected.add(name)
+            self._manifest.devices[name].identity = self._drivers[name].identity
+        elif event.kind == "lost":
+            self._connected.discard(name)
+        self._writer.events.write(name, event.kind, event.text, event.count)
+        self._on_event(name, event)
+
+    def _merge(self) -> None:
+        """Feed the pipeline in order of arrival."""
+        while not self._inbox.ended:
+            for name, item in self._inbox.get_all(MERGE_EVERY_S):
+                for arrival_ns, sample in item.samples:
+                    self._pipeline.take(name, arrival_ns, sample)
+            self._pipeline.advance(time.monotonic_ns())
+            time.sleep(MERGE_EVERY_S)  # collects samples: the order of streams needs no haste
+        self._pipeline.finish()
+
+    # -- the calling thread --
+
+    def _watch(self, duration_s: float | None, stop: threading.Event, on_status: OnStatus) -> str:
+        """Wait for the end of the take; gives its cause."""
+        low_bytes = low_water_bytes(self._bytes_per_s)
+        while True:
+            elapsed_s = (time.monotonic_ns() - self._start_ns) / NS_PER_S
+            left_s = STATUS_EVERY_S if duration_s is None else min(STATUS_EVERY_S, duration_s - elapsed_s)
+            if self._failure is not None:
+                return f"error: {self._failure}"
+            if left_s <= 0:
+                return "duration"
+            if stop.wait(left_s):
+                return "interrupt"
+            free = free_bytes(self._folder)
+            if free < low_bytes:
+                text = f"disk low: {free / 1e9:.2f} GB left, the take was ended while it could be closed"
+                self._writer.events.write("disk", "warning", text)
+                return text
+            on_status(self._status(free))
+
+    def _status(self, free: int) -> TakeStatus:
+        now_s = time.monotonic()
+        interval_s = max(now_s - self._last_status_s, 1e-3)
+        self._last_status_s = now_s
+        devices = []
+        for name, device in self._devices.items():
+            summary = device.summary
+            rate_hz = (summary.received - self._last_counts.get(name, 0)) / interval_s
+            self._last_counts[name] = summary.received
+            lag_s = (time.monotonic_ns() - device.last_host_ns) / NS_PER_S if device.last_host_ns else None
+            devices.append(
+                DeviceStatus(
+                    name, summary.kind, rate_hz, summary.received, summary.lost, summary.dropped, lag_s,
+                    name in self._connected,
+                )
+            )  # fmt: skip
+        elapsed_s = (time.monotonic_ns() - self._start_ns) / NS_PER_S
+        left_s = max(0.0, free - low_water_bytes(self._bytes_per_s)) / self._bytes_per_s
+        return TakeStatus(self._folder, elapsed_s, devices, free, left_s)
+
+    def _finish(self, end_ns: int, stopped_by: str) -> Manifest:
+        for device, dropped in self._writer.raw.dropped_bytes.items():
+            self._writer.events.write(device, "drop", f"the raw tape lost {dropped} bytes for want of room", dropped)
+        self._manifest.clocks = self._pipeline.clock_summaries()
+        self._writer.close(end_ns - self._start_ns, stopped_by)
+        return self._manifest
+
+
+def _in_take(device: RigDevice, driver: Driver, cameras: list[RigDevice]) -> DeviceInTake:
+    stream = driver.streams[0]
+    return DeviceInTake(
+        name=device.name,
+        config=device.config,
+        clock=device.clock,
+        tick_hz=driver.tick_hz,
+        wrap_bits=driver.wrap_bits,
+        camera=cameras.index(device) if device in cameras else None,
+        summary=StreamSummary(stream.kind, stream.rate_hz),
+    )
+
+
+def _half_period_ns(cameras: list[RigDevice], drivers: dict[str, Driver]) -> int:
+    rates_hz = [drivers[camera.name].streams[0].rate_hz or 30.0 for camera in cameras]
+    return round(0.5 * NS_PER_S / max(rates_hz, default=30.0))
+
+
+def _size(item: Received) -> int:
+    size = 0
+    for _, sample in item.samples:
+        if isinstance(sample, ScanSample):
+            size += sample.points.nbytes
+        elif isinstance(sample, FrameSample):
+            size += len(sample.packet)
+        else:
+            size += SAMPLE_BYTES
+    return size
+
+
+def _without_payload(item: Received) -> tuple[Received, int]:
+    """What is left of samples that find no room: a lost picture keeps its time. Gives how many others were lost."""
+    kept: list[tuple[int, Sample]] = []
+    for arrival_ns, sample in item.samples:
+        if isinstance(sample, FrameSample):
+            kept.append((arrival_ns, LostFrame(sample.device_ticks)))
+    return Received(samples=tuple(kept)), len(item.samples) - len(kept)

@@ -1,0 +1,153 @@
+"""Brings every device clock onto the host's monotonic clock: samples with device ticks in, samples with time out.
+
+One clock map per device clock; devices that share a clock feed one map through streams of their own. The first
+samples of a sync epoch are held back until the map knows the epoch, so that the first stamps are good too. A device's
+known latency is taken off its arrivals, which is the same as taking it off the mapped times and lets devices with
+different latencies share a clock.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.samples import ClockPairs, Sample, ScanSample
+from recorder.clock import ClockMap, ClockStream
+
+HOLD_AT_START_NS = 1_000_000_000
+HOLD_NS = 400_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock.
+
+    point_host_ns: host times of a scan's points, (n,) int64; the scan's time is the greatest of them.
+    """
+
+    device: str
+    host_ns: int
+    device_ns: int
+    sample: Sample
+    point_host_ns: npt.NDArray[np.int64] | None = None
+
+
+@dataclass(slots=True)
+class _DeviceStream:
+    device: str
+    clock: "_Clock"
+    stream: ClockStream
+    tick_hz: float
+    latency_ns: int
+    last_host_ns: int = -(1 << 62)
+    pairs: list[tuple[int, int]] = field(default_factory=list)
+    batches: list[npt.NDArray[np.int64]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Clock:
+    name: str
+    map: ClockMap
+    hold_until_ns: int
+    epoch: int
+    held: list[tuple[_DeviceStream, int, int, Sample]] = field(default_factory=list)
+
+
+class Timebase:
+    """All clocks of a rig. Not thread safe: one thread feeds it."""
+
+    def __init__(self, start_ns: int) -> None:
+        """start_ns: host time of the take's start; nothing is stamped before HOLD_AT_START_NS after it."""
+        self._start_ns = start_ns
+        self._clocks: dict[str, _Clock] = {}
+        self._streams: dict[str, _DeviceStream] = {}
+        self._epochs_begun: list[tuple[str, int]] = []
+
+    def add_device(self, device: str, clock: str, tick_hz: float, wrap_bits: int, latency_ns: int) -> None:
+        """Announce a device and the clock that stamps it."""
+        if clock not in self._clocks:
+            clock_map = ClockMap(tick_hz, wrap_bits)
+            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS, clock_map.epoch)
+        shared = self._clocks[clock]
+        self._streams[device] = _DeviceStream(
+            device, shared, shared.map.stream(tick_hz, wrap_bits), tick_hz, latency_ns
+        )
+
+    def clocks(self) -> dict[str, ClockMap]:
+        """The clock maps by name, for status and manifest."""
+        return {name: clock.map for name, clock in self._clocks.items()}
+
+    def epochs_begun(self) -> list[tuple[str, int]]:
+        """Clocks (with their epoch) that began a new sync epoch since this was last called."""
+        begun, self._epochs_begun = self._epochs_begun, []
+        return begun
+
+    def take(self, device: str, arrival_ns: int, sample: Sample) -> list[Stamped]:
+        """Feed one sample. Gives it back stamped, or nothing while it is held (see `release`) or has no time."""
+        entry = self._streams[device]
+        clock = entry.clock
+        arrival_ns -= entry.latency_ns
+        if isinstance(sample, ClockPairs):
+            entry.batches.append(np.column_stack((sample.ticks, sample.arrival_ns)))
+            entry.stream.observe_many(sample.ticks, sample.arrival_ns - entry.latency_ns)
+            self._watch_epoch(clock, arrival_ns)
+            return []
+        if isinstance(sample, ScanSample):
+            device_ns = entry.stream.unwrap(sample.last_ticks)
+        elif sample.device_ticks is None:
+            return [Stamped(device, arrival_ns, arrival_ns, sample)]
+        else:
+            entry.pairs.append((sample.device_ticks, arrival_ns + entry.latency_ns))
+            device_ns = entry.stream.observe(sample.device_ticks, arrival_ns)
+            self._watch_epoch(clock, arrival_ns)
+        if arrival_ns < clock.hold_until_ns:
+            clock.held.append((entry, device_ns, arrival_ns, sample))
+            return []
+        stamped = self._release_clock(clock)
+        stamped.append(self._stamp(entry, device_ns, arrival_ns, sample))
+        return stamped
+
+    def _watch_epoch(self, clock: _Clock, arrival_ns: int) -> None:
+        if clock.map.epoch != clock.epoch:
+            clock.epoch = clock.map.epoch
+            clock.hold_until_ns = max(clock.hold_until_ns, arrival_ns + HOLD_NS)
+            self._epochs_begun.append((clock.name, clock.epoch))
+
+    def release(self, now_ns: int) -> list[Stamped]:
+        """Held samples whose time has come."""
+        stamped: list[Stamped] = []
+        for clock in self._clocks.values():
+            if clock.held and now_ns >= clock.hold_until_ns:
+                stamped.extend(self._release_clock(clock))
+        return stamped
+
+    def flush(self) -> list[Stamped]:
+        """All held samples: the end of a take."""
+        return [stamped for clock in self._clocks.values() for stamped in self._release_clock(clock)]
+
+    def _release_clock(self, clock: _Clock) -> list[Stamped]:
+        held, clock.held = clock.held, []
+        return [self._stamp(*entry) for entry in held]
+
+    def _stamp(self, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
+        host_ns = min(entry.clock.map.host_ns(device_ns), arrival_ns)
+        point_host_ns = None
+        if isinstance(sample, ScanSample) and len(sample.points):
+            ticks = np.rint(sample.points["timestamp"] * entry.tick_hz).astype(np.int64)
+            point_host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
+            host_ns = int(point_host_ns.max())
+        host_ns = max(host_ns, min(entry.last_host_ns, arrival_ns))
+        entry.last_host_ns = host_ns
+        return Stamped(entry.device, host_ns, device_ns, sample, point_host_ns)
+
+    def take_pairs(self) -> dict[str, npt.NDArray[np.int64]]:
+        """(ticks, arrival) pairs (n, 2) of each device since this was last called, for the raw tape."""
+        taken = {}
+        for device, entry in self._streams.items():
+            parts = list(entry.batches)
+            if entry.pairs:
+                parts.append(np.array(entry.pairs, dtype=np.int64))
+            if parts:
+                taken[device] = np.concatenate(parts)
+            entry.pairs, entry.batches = [], []
+        return taken
