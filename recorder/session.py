@@ -17,11 +17,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-
 from calibration.model import Calibration, CalibrationError, dump, load_calibration, validate
 from drivers.device import DeviceError, Driver, received
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, Sample, ScanSample
-from recorder.errors import ConfigError, RecorderError
+from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.pipeline import DeviceInTake, Pipeline
 from recorder.recording.folder import check_output, create_take_folder, free_bytes, low_water_bytes
 from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, StreamSummary
@@ -83,7 +82,7 @@ def record(
     """Record one take of a rig until `stop` is set, the duration is over or the disk is low.
 
     Gives the folder and its manifest. Raises RecorderError before anything was recorded: a bad calibration, an output
-    that can't hold a minute, required devices that are missing.
+    that can't hold a minute, required devices that are missing; StorageError when the files can't be finished.
     """
     drivers = {device.name: device.driver.create(device.name, device.config) for device in rig.devices}
     calibration = _calibration(rig, _cameras(rig, drivers))
@@ -342,7 +341,9 @@ class Take:
         for device, dropped in self._writer.raw.dropped_bytes.items():
             self._writer.events.write(device, "drop", f"the raw tape lost {dropped} bytes for want of room", dropped)
         self._manifest.clocks = self._pipeline.clock_summaries()
-        self._writer.close(end_ns - self._start_ns, stopped_by)
+        faults = self._writer.close(end_ns - self._start_ns, stopped_by)
+        if faults:
+            raise StorageError(f"{self._folder}: could not be finished: {'; '.join(faults)}")
         return self._manifest
 
 

@@ -34,6 +34,7 @@ def video_name(camera: int) -> str:
 class VideoWriter:
     """Writes one camera's pictures.
 
+    pictures: how many are in the file; refused: how many can't be, being of another codec or size.
     on_refused is told (once) why pictures can't go into this file any more; their tickets fail.
     """
 
@@ -42,9 +43,9 @@ class VideoWriter:
     ) -> None:
         """The file is created with the first picture; it must not exist."""
         self.pictures = 0
+        self.refused = 0
         self._path = path
         self._on_refused = on_refused
-        self._refused = False
         self._format: VideoFormat | None = None
         self._last_ms = -1
         self._queue: ByteQueue[tuple[int, FrameSample, Ticket]] = ByteQueue(QUEUE_BYTES)
@@ -114,8 +115,8 @@ class VideoWriter:
         return packet
 
     def _refuse(self, video: VideoFormat) -> None:
-        if not self._refused:
-            self._refused = True
+        self.refused += 1
+        if self.refused == 1:
             width, height = self._size
             self._on_refused(
                 f"{self._path.name} holds {self._codec} {width}x{height}; the camera now sends {video.codec} "

@@ -126,27 +126,33 @@ class RecordingWriter:
             pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None))
         self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
 
-    def close(self, duration_ns: int, stopped_by: str, *, complete: bool = True) -> None:
-        """Finish all files; recording.json says complete last of all."""
-        files: dict[str, FileEntry] = {}
-        for video in self.videos:
+    def close(self, duration_ns: int, stopped_by: str) -> list[str]:
+        """Finish all files; recording.json says complete last of all, unless a file could not be finished.
+
+        Gives what went wrong, a line each; the other files are closed all the same.
+        """
+        faults: list[str] = []
+        for camera, video in zip(self.manifest.cameras, self.videos, strict=True):
             video.close()
-        if self._scans is not None:
-            files |= self._scans.close()
-        files |= self._lines.close()
-        files |= self.raw.close()
+            self.manifest.devices[camera].stream.written = video.pictures
+            self.manifest.devices[camera].stream.dropped += video.refused
+        files: dict[str, FileEntry] = {}
+        for closer in (self._scans, self._lines, self.raw):
+            if closer is not None:
+                try:
+                    files |= closer.close()
+                except OSError as error:
+                    faults.append(f"{type(closer).__name__}: {error}")
         self.events.close()
-        for index in range(len(self.videos)):
-            if self.videos[index].pictures:
-                files[video_name(index)] = hash_file(self.folder / video_name(index))
-        for name in (CALIBRATION_NAME, EVENTS_NAME):
-            if (self.folder / name).exists():
-                files[name] = hash_file(self.folder / name)
+        small = [CALIBRATION_NAME, EVENTS_NAME, *(video_name(index) for index in range(len(self.videos)))]
+        files |= {name: hash_file(self.folder / name) for name in small if (self.folder / name).exists()}
         self.manifest.files = dict(sorted(files.items()))
         self.manifest.duration_s = duration_ns / NS_PER_S
         self.manifest.stopped_by = stopped_by
-        self.manifest.state = "complete" if complete else "recording"
+        if not faults:
+            self.manifest.state = "complete"
         write_manifest(self.folder, self.manifest)
+        return faults
 
 
 def new_manifest(

@@ -1,0 +1,209 @@
+"""The command line. Each command is thin: it reads its arguments, calls the part that does the work, prints.
+
+Exit codes: 0 good; 1 it could not be done; 2 wrong use or a wrong configuration; `check` and `recover` have their own.
+"""
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+import click
+from rich.console import Console
+
+from recorder import simulation
+from recorder.errors import ConfigError, RecorderError
+from recorder.recording.check import check as check_recording
+from recorder.recording.check import print_report
+from recorder.recording.info import info as recording_info
+from recorder.recording.info import print_info
+from recorder.rig import Rig, load_rig, parse_rig
+from recorder.session import record as record_take
+from recorder.status import StatusDisplay, print_summary
+
+RigFile = click.Path(exists=True, dir_okay=False, path_type=Path)
+Folder = click.Path(file_okay=False, path_type=Path)
+set_option = click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a key path of the rig (repeatable)."
+)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("-v", "--verbose", is_flag=True, help="Show the trace of an error.")
+@click.version_option(package_name="rigtape")
+@click.pass_context
+def main(context: click.Context, verbose: bool) -> None:
+    """A tape recorder for sensor rigs: IMUs, cameras, GNSS and lidars on one time base.
+
+    \b
+    First steps, without any hardware:
+      rigtape record --simulate --duration 20 -o demo
+      rigtape check demo/*
+    """
+    context.obj = verbose
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.CRITICAL)
+
+
+@contextlib.contextmanager
+def clear_errors(verbose: bool) -> Iterator[None]:
+    """Turn the recorder's own errors into one clear line and the right exit code."""
+    try:
+        yield
+    except RecorderError as error:
+        if verbose:
+            raise
+        click.echo(f"rigtape: {error}", err=True)
+        sys.exit(2 if isinstance(error, ConfigError) else 1)
+
+
+@main.command()
+@click.argument("rig", type=RigFile, required=False)
+@click.option("--simulate", is_flag=True, help="Record simulated devices (the built-in rig, or those RIG describes).")
+@click.option("-o", "--output", type=Folder, default="recordings", show_default=True, help="Where takes go.")
+@click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
+@click.option("--name", help="Name of the take's folder (default: UTC time).")
+@set_option
+@click.pass_obj
+def record(
+    verbose: bool,
+    rig: Path | None,
+    simulate: bool,
+    output: Path,
+    duration: float | None,
+    name: str | None,
+    settings: tuple[str, ...],
+) -> None:
+    """Record one take of the rig described in RIG (a rig.yaml) into a new folder.
+
+    Stop with Ctrl-C; all files are then finished. Each take goes to OUTPUT/<UTC time>, or OUTPUT/NAME.
+
+    \b
+    Examples:
+      rigtape record rig.yaml -o recordings
+      rigtape record --simulate --duration 20 -o demo
+      rigtape record --simulate --set simulate.trajectory=brisk --set simulate.seed=3 -o demo
+    """
+    if rig is None and not simulate:
+        raise click.UsageError("give a RIG.yaml, or --simulate to record the built-in simulated rig")
+    if name is not None and (name in (".", "..") or Path(name).name != name):
+        raise click.UsageError(f"--name {name}: must be a plain folder name")
+    console = Console()
+    stop = _stop_on_signals(console)
+    with clear_errors(verbose), _rig(rig, simulate, settings) as loaded, StatusDisplay(console) as display:
+        folder, manifest = record_take(
+            loaded,
+            output,
+            name=name,
+            duration_s=duration,
+            stop=stop,
+            on_status=display.show,
+            on_event=display.event,
+        )
+    print_summary(console, manifest)
+    console.print(f"{manifest.duration_s:.1f} s recorded in {folder} (ended by: {manifest.stopped_by})", soft_wrap=True)
+    console.print(f"next: rigtape check {folder}", soft_wrap=True)
+    console.print(f"      rigtape info {folder}", soft_wrap=True)
+    if manifest.stopped_by not in ("duration", "interrupt"):
+        sys.exit(1)
+
+
+@contextlib.contextmanager
+def _rig(path: Path | None, simulate: bool, settings: tuple[str, ...]) -> Iterator[Rig]:
+    if not simulate:
+        assert path is not None
+        yield load_rig(path, settings)
+        return
+    simulated = simulation.SimulatedRig(path, settings)
+    try:
+        yield parse_rig(simulated.yaml, "simulated rig", Path.cwd())
+    finally:
+        simulated.close()
+
+
+def _stop_on_signals(console: Console) -> threading.Event:
+    """An event that Ctrl-C or SIGTERM sets; asking again does not hurry what must be finished."""
+    stop = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        console.print("finishing the files..." if not stop.is_set() else "still finishing the files, please wait...")
+        stop.set()
+
+    signal.signal(signal.SIGINT, on_signal)
+    signal.signal(signal.SIGTERM, on_signal)
+    return stop
+
+
+@main.command()
+@click.argument("rig", type=RigFile, required=False)
+@click.option("--ideal", type=Folder, metavar="DIR", help="Write the same world straight to a recording.")
+@click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds of it (with --ideal).")
+@set_option
+def simulate(rig: Path | None, ideal: Path | None, duration: float | None, settings: tuple[str, ...]) -> None:
+    """Run simulated devices on ptys and ports, for any program to read, and print the rig.yaml to record them.
+
+    \b
+    Examples:
+      rigtape simulate > rig.yaml &          then: rigtape record rig.yaml
+      rigtape simulate --ideal twin --duration 30 --set simulate.trajectory=brisk
+
+    With --ideal nothing runs: the same world and seed are written to a recording with the true times, so that what
+    the way through devices and clocks costs can be measured.
+    """
+    if (ideal is None) != (duration is None):
+        raise click.UsageError("--ideal and --duration go together")
+    arguments = simulation.command(rig, settings)
+    if ideal is not None:
+        arguments += ["--ideal", str(ideal), "--duration", str(duration)]
+    sys.stdout.flush()
+    os.execv(arguments[0], arguments)
+
+
+@main.command()
+@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.pass_obj
+def info(verbose: bool, recording: Path, as_json: bool) -> None:
+    """Say what is in a recording.
+
+    \b
+    Example:
+      rigtape info demo/2026-11-22T10-00-00Z
+    """
+    with clear_errors(verbose):
+        found = recording_info(recording)
+    if as_json:
+        click.echo(found.to_json())
+    else:
+        print_info(found, Console())
+
+
+@main.command()
+@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option("--deep", is_flag=True, help="Also decode every picture and compare every file's SHA-256.")
+@click.pass_obj
+def check(verbose: bool, recording: Path, as_json: bool, deep: bool) -> None:
+    """Check that a recording is whole and that other programs will read it right.
+
+    Exit code 0: good; 1: warnings; 2: bad.
+
+    \b
+    Example:
+      rigtape check demo/2026-11-22T10-00-00Z
+    """
+    with clear_errors(verbose):
+        report = check_recording(recording, deep=deep)
+    if as_json:
+        click.echo(report.to_json())
+    else:
+        print_report(report, Console())
+    sys.exit(report.exit_code)
+
+
+if __name__ == "__main__":
+    main()
