@@ -1,0 +1,60 @@
+"""`python -m simulated_devices`: simulated devices on ptys and ports of this host, for any program to read.
+
+Prints the rig to record them as one YAML document, ended by a line `...`, and runs until it is interrupted or the
+process that started it ends.
+"""
+
+import argparse
+import logging
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: a process per device is parallel enough
+
+import cv2
+import yaml
+
+from recorder.errors import ConfigError
+from simulated_devices.rig import DeviceDiedError, Simulation, read_rig
+
+EXIT_DEVICE_DIED = 1
+EXIT_WRONG_USE = 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the simulated rig; give the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m simulated_devices", epilog="example: python -m simulated_devices --set simulate.seed=3"
+    )
+    parser.add_argument("rig", nargs="?", type=Path, metavar="RIG.yaml", help="default: the built-in rig")
+    parser.add_argument("--set", action="append", default=[], metavar="key=value", help="set a key path of the rig")
+    parser.add_argument("--report", action="store_true", help="at the end, say what was sent and how timely")
+    options = parser.parse_args(arguments)
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        with Simulation(read_rig(options.rig, tuple(options.set)), report=options.report) as simulation:
+            yaml.safe_dump(simulation.document, sys.stdout, sort_keys=False, explicit_end=True)
+            sys.stdout.flush()
+            simulation.run()
+    except KeyboardInterrupt:
+        return 0
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return EXIT_WRONG_USE
+    except DeviceDiedError as error:
+        sys.stderr.write(f"{error}\n")
+        return EXIT_DEVICE_DIED
+    return 0
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""A simulated RTK receiver: GGA, RMC, GST and ZDA of each epoch as NMEA 0183 on a pty paced at its baud rate."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from simulated_devices.timing import (
+    MILLISECOND_NS,
+    SECOND_NS,
+    UART_CHUNK_BYTES,
+    DelayModel,
+    Opened,
+    Pacer,
+    Pty,
+    Stage,
+    UartTransmitter,
+    random_for,
+)
+from simulated_devices.world import FloatArray, GeodeticOrigin, Trajectory
+
+ORIGIN = GeodeticOrigin(60.1738, 24.9065, 14.19, 17.8)
+RATES_HZ = (1, 2, 4, 5, 10, 20)
+UTC_OFFSET_NS = 100 * MILLISECOND_NS
+SIGMA_M = (0.010, 0.012, 0.020)  # north, east, up: what GST states and what the noise is
+KNOT_M_S = 1852.0 / 3600.0
+
+DELAY = DelayModel(
+    floor_ns=60 * MILLISECOND_NS,
+    jitter_scale_ns=8 * MILLISECOND_NS,
+    burst_probability=0.01,
+    burst_ns=80 * MILLISECOND_NS,
+)
+_LOOKAHEAD_NS = 300 * MILLISECOND_NS
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class NmeaSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """Keys of the device that the simulation honours."""
+
+    clock: str = ""
+    baud: int = 115200
+    rate_hz: int = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """One epoch's solution: UTC in nanoseconds since 1970, degrees, metres, m/s east and north."""
+
+    utc_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    undulation_m: float
+    velocity_m_s: tuple[float, float]
+    sigma_m: tuple[float, float, float]
+
+
+def sentence(body: str) -> bytes:
+    """`$body*HH` and CR LF, with the XOR of the body's characters."""
+    checksum = 0
+    for character in body.encode():
+        checksum ^= character
+    return f"${body}*{checksum:02X}\r\n".encode()
+
+
+def degrees_minutes(angle_deg: float, degree_digits: int) -> str:
+    """An angle without its sign as dddmm.mmmmmmmm; never 60 minutes."""
+    unit = 10**8
+    degrees, rest = divmod(round(abs(angle_deg) * 60 * unit), 60 * unit)
+    return f"{degrees:0{degree_digits}d}{rest // unit:02d}.{rest % unit:08d}"
+
+
+def epoch_sentences(fix: Fix) -> list[bytes]:
+    """GGA, RMC, GST and ZDA of one RTK fix."""
+    utc = _EPOCH + timedelta(microseconds=fix.utc_ns // 1000)
+    clock = f"{utc:%H%M%S}.{utc.microsecond // 10000:02d}"
+    position = (
+        f"{degrees_minutes(fix.latitude_deg, 2)},{'N' if fix.latitude_deg >= 0 else 'S'},"
+        f"{degrees_minutes(fix.longitude_deg, 3)},{'E' if fix.longitude_deg >= 0 else 'W'}"
+    )
+    east, north = fix.velocity_m_s
+    knots = float(np.hypot(east, north)) / KNOT_M_S
+    course_deg = float(np.degrees(np.arctan2(east, north))) % 360.0
+    north_m, east_m, up_m = fix.sigma_m
+    ellipse = f"{max(north_m, east_m):.4f},{min(north_m, east_m):.4f},{90.0 if east_m > north_m else 0.0:.1f}"
+    return [
+        sentence(f"GNGGA,{clock},{position},4,24,0.6,{fix.altitude_m:.4f},M,{fix.undulation_m:.4f},M,1.0,0001"),
+        sentence(f"GNRMC,{clock},A,{position},{knots:.3f},{course_deg:.2f},{utc:%d%m%y},,,R,V"),
+        sentence(f"GNGST,{clock},0.0120,{ellipse},{north_m:.4f},{east_m:.4f},{up_m:.4f}"),
+        sentence(f"GNZDA,{clock},{utc:%d,%m,%Y},00,00"),
+    ]
+
+
+class NmeaSimulator:
+    """The receiver on its pty: an epoch at each step of its UTC, sent some time later at the baud rate."""
+
+    _pty: Pty
+
+    def __init__(self, name: str, settings: NmeaSettings, stage: Stage, trajectory: Trajectory) -> None:
+        if settings.rate_hz not in RATES_HZ:
+            raise ValueError(f"devices.{name}.rate_hz: {settings.rate_hz} is none of {', '.join(map(str, RATES_HZ))}")
+        self.name = name
+        self.opened = Opened()
+        self.pacer = Pacer()
+        self._stage = stage
+        self._trajectory = trajectory
+        self._period_ns = SECOND_NS // settings.rate_hz
+        self._random = random_for(stage.seed, "gnss", name)
+        offset_ns = int(self._random.integers(-UTC_OFFSET_NS, UTC_OFFSET_NS))
+        self._clock = stage.clock(settings.clock or name, start_ns=stage.epoch_utc_ns + offset_ns)
+        self._delay = stage.delay(name, DELAY)
+        self._uart = UartTransmitter(settings.baud)
+
+    def open(self, folder: Path) -> dict[str, object]:
+        """Make the pty; give the keys a recorder needs."""
+        self._pty = Pty(folder / self.name)
+        latency_ns = DELAY.floor_ns + self._uart.transmission_ns(UART_CHUNK_BYTES)
+        return {"port": str(self._pty.path), "latency_s": round(latency_ns * 1e-9, 6)}
+
+    def close(self) -> None:
+        """Close the pty."""
+        self._pty.close()
+
+    def summary(self) -> str:
+        """What was sent, and what was lost."""
+        return f"{self.pacer.summary()}, {self._pty.lost_bytes} bytes lost, {self._pty.unheard_bytes} unheard"
+
+    def run(self) -> None:
+        """Send fixes for ever."""
+        epoch = self._clock.device_ns(time.monotonic_ns()) // self._period_ns + 1
+        while True:
+            host_ns = self._clock.host_ns(epoch * self._period_ns)
+            while time.monotonic_ns() < host_ns - _LOOKAHEAD_NS:
+                self._send_due()
+            release_ns = int(self._delay.release_ns(np.array([host_ns]))[0])
+            self._uart.push(release_ns, b"".join(epoch_sentences(self._fix(epoch * self._period_ns, host_ns))))
+            epoch += 1
+
+    def _send_due(self) -> None:
+        """Wait for the next chunk, or a little, and send what is due."""
+        due_ns = self._uart.next_due_ns()
+        soon_ns = time.monotonic_ns() + 10 * MILLISECOND_NS
+        self._pty.wait_until(soon_ns if due_ns is None else min(due_ns, soon_ns))
+        for chunk_due_ns, chunk in self._uart.pop_due(time.monotonic_ns()):
+            self._pty.send(chunk)
+            self.pacer.done(chunk_due_ns)
+        self._pty.receive()  # commands are read and not followed
+        if not self.opened and self._pty.is_open():
+            self.opened.set()
+
+    def _fix(self, utc_ns: int, host_ns: int) -> Fix:
+        kinematics = self._trajectory.kinematics(self._stage.world_s(np.array([host_ns])))
+        north_m, east_m, up_m = self._random.normal(0.0, SIGMA_M)
+        measured: FloatArray = kinematics.p + np.array([[east_m, north_m, up_m]])
+        latitude_deg, longitude_deg, altitude_m = ORIGIN.to_geodetic(measured)
+        east, north, _ = kinematics.velocity_m_s[0].tolist()
+        return Fix(
+            utc_ns,
+            float(latitude_deg[0]),
+            float(longitude_deg[0]),
+            float(altitude_m[0]),
+            ORIGIN.undulation_m,
+            (east, north),
+            SIGMA_M,
+        )

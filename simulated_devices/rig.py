@@ -1,0 +1,362 @@
+"""The simulated rig: reads a rig.yaml, starts a process per device, and fills in what a recorder needs to know.
+
+The world stands still until the devices have been opened, so that a recording sees the motion from its start.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from importlib.resources import files
+from multiprocessing import connection, get_context
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+import yaml
+
+from recorder.errors import ConfigError
+from recorder.rig import apply_settings
+from simulated_devices.camera import CameraSettings, CameraSimulator
+from simulated_devices.nmea import NmeaSettings, NmeaSimulator
+from simulated_devices.pose import PoseSettings, PoseSimulator
+from simulated_devices.robosense import RobosenseSettings, RobosenseSimulator
+from simulated_devices.scene import PinholeCamera, Room, stereo_pair
+from simulated_devices.timing import SECOND_NS, Opened, Stage, die_with_parent, wake_precisely
+from simulated_devices.world import Trajectory
+from simulated_devices.xsens import XsensSettings, XsensSimulator
+
+log = logging.getLogger(__name__)
+
+BUILT_IN = "built-in rig"
+OPENING_NS = 5 * SECOND_NS
+_EXIT_S = 0.5
+
+Settings = TypeVar("Settings", bound=msgspec.Struct)
+
+
+class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """The `simulate` keys of a rig.
+
+    jitter: factor on all transport jitter and bursts. skew_ppm: bound of the skew each clock draws.
+    """
+
+    trajectory: str = "gentle"
+    seed: int = 1
+    jitter: float = 1.0
+    skew_ppm: float = 50.0
+
+
+class SimulatedDevice(Protocol):
+    """One device: `open` and `close` in the parent, `run` in a process of its own.
+
+    opened: set once somebody has opened it, None where a device cannot know.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its name in the rig."""
+
+    @property
+    def opened(self) -> Opened | None:
+        """Whether it has been opened."""
+
+    def open(self, folder: Path) -> dict[str, object]:
+        """Make its pty or port; give the keys a recorder needs."""
+
+    def close(self) -> None:
+        """Let go of this process's side of it."""
+
+    def run(self) -> None:
+        """Be the device, until the process ends."""
+
+    def summary(self) -> str:
+        """What was sent, and how timely."""
+
+
+class DeviceDiedError(Exception):
+    """The process of a simulated device ended by itself."""
+
+
+def read_rig(path: Path | None, settings: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The rig file, or the built-in rig, with `key.path=value` settings applied. Raises ConfigError."""
+    origin = str(path) if path else BUILT_IN
+    try:
+        text = path.read_text() if path else files("simulated_devices").joinpath("rig.yaml").read_text()
+        source = yaml.safe_load(text)
+    except OSError as error:
+        raise ConfigError(f"{origin}: cannot read: {error.strerror}") from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{origin}: not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(source, dict):
+        raise ConfigError(f"{origin}: must be a mapping with the keys simulate and devices")
+    return apply_settings(source, settings)
+
+
+def simulate_settings(source: Mapping[str, Any]) -> SimulateSettings:
+    """The `simulate` keys, validated. Raises ConfigError."""
+    entry = source.get("simulate") or {}
+    if not isinstance(entry, dict):
+        raise ConfigError("simulate: must be a mapping")
+    allowed = SimulateSettings.__struct_fields__
+    for key in entry:
+        if key not in allowed:
+            raise ConfigError(f"simulate.{key}: unknown key; allowed: {', '.join(sorted(allowed))}")
+    settings = _convert(entry, SimulateSettings, "simulate")
+    for key in ("seed", "jitter", "skew_ppm"):
+        if getattr(settings, key) < 0:
+            raise ConfigError(f"simulate.{key}: must not be negative")
+    return settings
+
+
+def calibration(cameras: list[PinholeCamera]) -> dict[str, Any]:
+    """The content of calibration.json for these cameras."""
+    return {
+        "cameras": [
+            {
+                "model": "pinhole",
+                "focalLengthX": camera.fx,
+                "focalLengthY": camera.fy,
+                "principalPointX": camera.cx,
+                "principalPointY": camera.cy,
+                "imageWidth": camera.width,
+                "imageHeight": camera.height,
+                "distortionCoefficients": [],
+                "imuToCamera": camera.camera_from_imu.tolist(),
+            }
+            for camera in cameras
+        ]
+    }
+
+
+class UdpPorts:
+    """Hands out UDP ports that nobody else uses, nor another simulation on this host."""
+
+    def __init__(self) -> None:
+        self._held: list[socket.socket] = []
+
+    def take(self, where: str, wanted: int) -> int:
+        """`wanted`, or a free port where that is taken."""
+        if not 0 <= wanted <= 65535:
+            raise ConfigError(f"{where}: {wanted} is not a port (0 to 65535)")
+        port = wanted
+        while (free := self._free(port)) is None:
+            port = 0
+        if wanted not in (0, free):
+            log.warning("%s: UDP port %d is in use, taking %d", where, wanted, free)
+        return free
+
+    def _free(self, port: int) -> int | None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+            try:
+                trial.bind(("127.0.0.1", port))
+            except OSError:
+                return None
+            bound: int = trial.getsockname()[1]
+        mark = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)  # held as long as this simulation lives
+        try:
+            mark.bind(f"\0rigtape-simulated-udp-{bound}")
+        except OSError:
+            mark.close()
+            return None
+        self._held.append(mark)
+        return bound
+
+
+class _Cast:
+    """Makes the devices of a rig around one world."""
+
+    def __init__(self, settings: SimulateSettings) -> None:
+        try:
+            self.trajectory = Trajectory.named(settings.trajectory, settings.seed)
+        except ValueError as error:
+            raise ConfigError(f"simulate.trajectory: {error}") from error
+        self.room = Room(settings.seed)
+        self.stage = Stage(settings.seed, settings.jitter, settings.skew_ppm)
+        self.cameras: list[PinholeCamera] = []
+        self._ports = UdpPorts()
+        self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
+            "xsens": self._xsens,
+            "nmea": self._nmea,
+            "robosense": self._robosense,
+            "stream": self._stream,
+            "pose": self._pose,
+        }
+
+    def device(self, name: str, entry: object) -> SimulatedDevice:
+        """The simulated device of one entry under `devices`. Raises ConfigError."""
+        if not isinstance(entry, dict):
+            raise ConfigError(f"devices.{name}: must be a mapping with the key driver")
+        driver = entry.get("driver")
+        if driver not in self._makers:
+            names = ", ".join(sorted(self._makers))
+            raise ConfigError(f"devices.{name}.driver: no simulated device for {driver!r}; there are: {names}")
+        try:
+            return self._makers[driver](name, entry)
+        except ValueError as error:  # its message begins with the key path
+            raise ConfigError(str(error)) from error
+
+    def _xsens(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = _baud_checked(name, _convert(entry, XsensSettings, f"devices.{name}"))
+        return XsensSimulator(name, settings, self.stage, self.trajectory)
+
+    def _nmea(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = _baud_checked(name, _convert(entry, NmeaSettings, f"devices.{name}"))
+        return NmeaSimulator(name, settings, self.stage, self.trajectory)
+
+    def _robosense(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = self._with_ports(
+            name, _convert(entry, RobosenseSettings, f"devices.{name}"), ("msop_port", "difop_port")
+        )
+        return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room)
+
+    def _stream(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = _convert(entry, CameraSettings, f"devices.{name}")
+        if len(self.cameras) == 2:
+            raise ValueError(f"devices.{name}: a simulated rig has at most two cameras")
+        for key in ("width", "height"):
+            if getattr(settings, key) % 2 or not 32 <= getattr(settings, key) <= 4096:
+                raise ValueError(f"devices.{name}.{key}: must be even, from 32 to 4096")
+        camera = stereo_pair(settings.width, settings.height)[len(self.cameras)]
+        self.cameras.append(camera)
+        return CameraSimulator(name, settings, self.stage, self.trajectory, self.room, camera)
+
+    def _pose(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = self._with_ports(name, _convert(entry, PoseSettings, f"devices.{name}"), ("port",))
+        return PoseSimulator(name, settings, self.stage, self.trajectory)
+
+    def _with_ports(self, name: str, settings: Settings, keys: tuple[str, ...]) -> Settings:
+        ports = {key: self._ports.take(f"devices.{name}.{key}", getattr(settings, key)) for key in keys}
+        return msgspec.structs.replace(settings, **ports)
+
+
+class Simulation:
+    """A running simulated rig; leaving it ends the devices and removes the temporary folder.
+
+    document: the rig with addresses, latencies and calibration filled in.
+    """
+
+    def __init__(self, source: dict[str, Any], *, report: bool = False) -> None:
+        """`report`: each device says at its end what it sent and how timely. Raises ConfigError."""
+        entries = source.get("devices")
+        if not isinstance(entries, dict) or not entries:
+            raise ConfigError("devices: a mapping of at least one device is needed")
+        cast = _Cast(simulate_settings(source))
+        self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]
+        self._cameras = cast.cameras
+        self._stage = cast.stage
+        self._source = source
+        self._report = report
+        self._parent = os.getppid()
+        self._processes: dict[str, BaseProcess] = {}
+
+    def __enter__(self) -> Simulation:
+        self._folder = Path(tempfile.mkdtemp(prefix="rigtape-simulated-"))
+        try:
+            self.document = self._open()
+            self._start()
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    def run(self) -> None:
+        """Keep the world going until the process that started this one is gone. Raises DeviceDiedError."""
+        first_opened_ns: int | None = None
+        while os.getppid() == self._parent:
+            moving = self._stage.start_ns != 0
+            ended = connection.wait([process.sentinel for process in self._processes.values()], 0.1 if moving else 0.02)
+            if ended:
+                dead = [name for name, process in self._processes.items() if process.sentinel in ended]
+                raise DeviceDiedError(f"simulated device {', '.join(dead)} ended by itself")
+            if moving:
+                continue
+            opened = [bool(device.opened) for device in self._devices if device.opened is not None]
+            if any(opened) and first_opened_ns is None:
+                first_opened_ns = time.monotonic_ns()
+            if all(opened) or (first_opened_ns is not None and time.monotonic_ns() > first_opened_ns + OPENING_NS):
+                self._stage.start()
+
+    def _open(self) -> dict[str, Any]:
+        document = dict(self._source)
+        document["devices"] = {
+            device.name: {**self._source["devices"][device.name], **device.open(self._folder)}
+            for device in self._devices
+        }
+        if self._cameras:
+            path = self._folder / "calibration.json"
+            path.write_text(json.dumps(calibration(self._cameras), indent=2) + "\n")
+            document["calibration"] = str(path)
+        return document
+
+    def _start(self) -> None:
+        context = get_context("fork")  # the children share the textures built here
+        for device in self._devices:
+            process = context.Process(
+                target=_device_process, args=(device, os.getpid(), self._report), name=device.name, daemon=True
+            )
+            process.start()
+            self._processes[device.name] = process
+        for device in self._devices:
+            device.close()
+
+    def _end(self) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+        for process in self._processes.values():
+            process.terminate()
+        deadline_s = time.monotonic() + _EXIT_S
+        for process in self._processes.values():
+            process.join(max(0.0, deadline_s - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+                process.join()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _device_process(device: SimulatedDevice, parent: int, report: bool) -> None:
+    """What runs in a device's process."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if report:
+            sys.stderr.write(f"{device.name}: {device.summary()}, {time.process_time():.2f} s of CPU\n")
+            sys.stderr.flush()
+        os._exit(0)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this one
+    signal.signal(signal.SIGTERM, end)
+    die_with_parent()
+    wake_precisely()
+    if os.getppid() == parent:
+        device.run()
+
+
+def _convert(entry: Mapping[str, Any], settings: type[Settings], where: str) -> Settings:
+    try:
+        return msgspec.convert(entry, type=settings)
+    except msgspec.ValidationError as error:
+        message, _, place = str(error).partition(" - at `$")
+        raise ConfigError(f"{where}{place.rstrip('`')}: {message}") from error
+
+
+def _baud_checked(name: str, settings: Settings) -> Settings:
+    baud: int = getattr(settings, "baud", 0)
+    if not 1200 <= baud <= 10_000_000:
+        raise ConfigError(f"devices.{name}.baud: {baud} is not from 1200 to 10000000")
+    return settings
