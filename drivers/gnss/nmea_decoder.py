@@ -217,7 +217,7 @@ class NmeaDecoder:
     reference_utc_ns: int
     sentences: int = 0
     rollovers: int = 0
-    _scanner: SentenceScanner = field(default_factory=SentenceScanner)
+    scanner: SentenceScanner = field(default_factory=SentenceScanner)
     _epoch: _Epoch | None = None
     _last_utc_ns: int | None = None
     _ender: tuple[str, int] | None = None
@@ -226,17 +226,17 @@ class NmeaDecoder:
     @property
     def bad_frames(self) -> int:
         """Sentences with a wrong or no checksum, or cut."""
-        return self._scanner.bad_frames
+        return self.scanner.bad_frames
 
     @property
     def skipped_bytes(self) -> int:
         """Bytes that belong to no sentence or binary message."""
-        return self._scanner.skipped_bytes
+        return self.scanner.skipped_bytes
 
     def feed(self, data: bytes) -> list[FixSample]:
         """The fixes that `data` completes."""
         fixes: list[FixSample] = []
-        for sentence in self._scanner.feed(data):
+        for sentence in self.scanner.feed(data):
             self.sentences += 1
             self._take(sentence, fixes)
         return fixes

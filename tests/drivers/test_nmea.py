@@ -1,18 +1,25 @@
 """NMEA decoder against gpsd's reading of real captures, and the driver over a pty."""
 
 import json
+import os
+import tty
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import reduce
 from itertools import pairwise
 from operator import xor
 from pathlib import Path
+from threading import Event
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from drivers.device import DeviceError
+from drivers.gnss import nmea
+from drivers.gnss.nmea import DRIVER, NmeaConfig, NmeaDriver
 from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, NmeaDecoder
-from drivers.samples import FixSample
+from drivers.samples import Chunk, FixSample, Received
 
 DATA = Path(__file__).parent.parent / "data" / "nmea"
 # The day of each capture; the coldboot one loses its date on the way.
@@ -288,9 +295,109 @@ def test_garbage_neither_raises_nor_grows_nor_hides_what_follows(garbage: list[b
     decoder = NmeaDecoder(utc_ns(NOON))
     for piece in garbage:
         decoder.feed(piece)
-        assert len(decoder._scanner._buffer) <= MAX_UBX_PAYLOAD_BYTES + 8
+        assert len(decoder.scanner._buffer) <= MAX_UBX_PAYLOAD_BYTES + 8
     decoder.flush()
     # A false header of a binary message may hold what follows back, but not for longer than such a message is.
     good = gga("130000.00") * (1 + (MAX_UBX_PAYLOAD_BYTES + MAX_SENTENCE_BYTES) // len(gga()))
     fixes = decoder.feed(good) + decoder.flush()
     assert [fix.device_ticks for fix in fixes][-1:] == [utc_ns("2026-11-22T13:00:00")]
+
+
+def make_driver(port: str, rate_hz: float = 10) -> NmeaDriver:
+    driver = DRIVER.create("gnss", NmeaConfig(driver="nmea", port=port, rate_hz=rate_hz))
+    assert isinstance(driver, NmeaDriver)
+    return driver
+
+
+def test_fixes_over_a_pty_then_hang_up() -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    driver = make_driver(os.ttyname(slave))
+    driver.connect()
+    os.write(master, rmc() + gga() + gst())
+    stop = Event()
+    data, fixes = b"", []
+    for received in driver.read(stop):
+        data += b"".join(chunk.data for chunk in received.chunks)
+        fixes += received.samples
+        if fixes:
+            stop.set()
+    assert data == rmc() + gga() + gst()
+    assert [fix.accuracy_source for _, fix in fixes] == ["gst"]
+    reading = driver.read(Event())
+    os.close(slave)
+    os.close(master)
+    with pytest.raises(DeviceError, match="device is gone"):
+        next(reading)
+    driver.close()
+    driver.close()
+
+
+def test_absent_port_is_named() -> None:
+    with pytest.raises(DeviceError, match="/dev/nowhere: cannot open at 38400 baud: No such file"):
+        make_driver("/dev/nowhere").connect()
+
+
+class ScriptedLink:
+    """Reads come from a list of (arrival in milliseconds, bytes)."""
+
+    def __init__(self, reads: list[tuple[int, bytes]]) -> None:
+        self.reads = iter(reads)
+
+    def read(self, timeout_s: float) -> tuple[int, bytes]:
+        arrival_ms, data = next(self.reads)
+        return arrival_ms * 1_000_000, data
+
+
+def scripted(
+    monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], rate_hz: float = 10
+) -> Iterator[Received]:
+    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    driver = make_driver("/dev/ttyX", rate_hz)
+    driver.connect()
+    assert [(stream.kind, stream.rate_hz) for stream in driver.streams] == [("gnss", rate_hz)]
+    return driver.read(Event())
+
+
+def test_fix_arrives_with_the_first_byte_of_its_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = rmc("120000.00") + gga("120000.00"), rmc("120000.10") + gga("120000.10")
+    reads = [
+        (1000, b"cut"),
+        (1010, first[:1]),
+        (1011, first[1:80]),
+        (1020, first[80:] + second[:9]),
+        (1060, second[9:]),
+    ]
+    reading = scripted(monkeypatch, [*reads, (1091, b""), (1190, b"$")])
+    parts = [next(reading) for _ in range(7)]
+    assert [arrival_ns // 1_000_000 for part in parts for arrival_ns, _ in part.samples] == [1010, 1020]
+    assert [len(part.samples) for part in parts] == [0, 0, 0, 0, 1, 1, 0]
+    assert parts[0].chunks == (Chunk(1_000_000_000, b"cut"),)
+    assert parts[5].chunks == ()
+
+
+def test_short_pause_does_not_end_an_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading = scripted(monkeypatch, [(1000, gga()), (1290, b""), (1295, gst()), (1596, b"")], rate_hz=1)
+    samples = [sample for _ in range(3) for sample in next(reading).samples]
+    assert [fix.accuracy_source for _, fix in samples if isinstance(fix, FixSample)] == ["gst"]
+
+
+def test_silence_is_a_device_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading = scripted(monkeypatch, [(0, gga()), (2900, b""), (3100, b"")])
+    assert len(next(reading).chunks) == 1
+    assert len(next(reading).samples) == 1
+    with pytest.raises(DeviceError, match="/dev/ttyX at 38400 baud: no data for 3 s"):
+        next(reading)
+
+
+def test_warnings_and_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = [(i * 500, b"\xfe\x80") for i in range(12)]
+    monkeypatch.setattr(nmea.time, "time_ns", lambda: utc_ns(NOON))
+    old = gga() + rmc(date="080407")
+    reads = [*noise, (6000, old), (6040, b""), (6100, b"\x80" * 5), (7200, b"")]
+    reading = scripted(monkeypatch, reads)
+    events = [event for _ in reads for event in next(reading).events]
+    assert [event.kind for event in events] == ["warning", "warning", "garbage"]
+    assert "no NMEA sentence for 3 s" in events[0].text
+    assert "1024 weeks" in events[1].text
+    assert events[2].count == 5

@@ -1,15 +1,23 @@
 """Xsens MTData2 decoder against captures decoded by others, and the driver over a pty."""
 
+import os
 import re
+import select
+import tty
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from drivers.device import DeviceError
+from drivers.imu import xsens
 from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder, XbusFramer, decode_mtdata2, mtdata2_items
-from drivers.samples import ImuSample, Vector
+from drivers.imu.xsens import DRIVER, XsensConfig, XsensDriver
+from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample, Vector
 
 DATA = Path(__file__).parent.parent / "data" / "xsens"
 # An MTi-300's measurement as MT Manager decoded it, with the temperature item of another one.
@@ -204,3 +212,236 @@ def test_garbage_neither_raises_nor_grows_nor_hides_what_follows(garbage: list[b
     assert samples
     assert samples[-1].device_ticks == 5719854
     assert len(decoder.framer._buffer) == 0
+
+
+# The handshake, byte for byte as the device manual has it.
+GO_TO_CONFIG = bytes.fromhex("FAFF3000D1")
+REQUEST_DEVICE_ID = bytes.fromhex("FAFF000001")
+REQUEST_FIRMWARE = bytes.fromhex("FAFF1200EF")
+GO_TO_MEASUREMENT = bytes.fromhex("FAFF1000F1")
+OUTPUTS_400 = "1020FFFF 1060FFFF 40200190 80200190 C0200064 0810000A"
+SET_OUTPUTS = bytes.fromhex("FAFFC018" + OUTPUTS_400 + "05")
+ANSWERS = {
+    GO_TO_CONFIG: EXAMPLE * 2 + bytes.fromhex("FAFF3100D0"),
+    REQUEST_DEVICE_ID: bytes.fromhex("FAFF0104012345672C"),
+    REQUEST_FIRMWARE: bytes.fromhex("FAFF1303010802E0"),
+    SET_OUTPUTS: bytes.fromhex("FAFFC118" + OUTPUTS_400 + "04"),
+    GO_TO_MEASUREMENT: bytes.fromhex("FAFF1100F0"),
+}
+
+
+class PtyDevice:
+    """The far end of a pty: answers known requests, remembers what it sent and was asked."""
+
+    def __init__(self, answers: dict[bytes, bytes]) -> None:
+        self.answers = answers
+        self.asked: list[bytes] = []
+        self.sent = b""
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self._wake_read, self._wake_write = os.pipe()
+        self._thread = Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        heard = b""
+        while self._wake_read not in select.select([self._master, self._wake_read], [], [])[0]:
+            heard += os.read(self._master, 4096)
+            for request in self.answers:
+                if heard.endswith(request):
+                    self.asked.append(heard)
+                    heard = b""
+                    self.send(self.answers[request])
+
+    def send(self, data: bytes) -> None:
+        self.sent += data
+        os.write(self._master, data)
+
+    def hang_up(self) -> None:
+        if self._thread.is_alive():
+            os.write(self._wake_write, b"x")
+            self._thread.join()
+            for descriptor in (self._master, self._slave, self._wake_read, self._wake_write):
+                os.close(descriptor)
+
+
+@pytest.fixture
+def device() -> Iterator[PtyDevice]:
+    pty_device = PtyDevice(dict(ANSWERS))
+    yield pty_device
+    pty_device.hang_up()
+
+
+def make_driver(port: str, **keys: object) -> XsensDriver:
+    driver = DRIVER.create("imu", XsensConfig(**{"driver": "xsens", "port": port, "baud": 460800, **keys}))
+    assert isinstance(driver, XsensDriver)
+    return driver
+
+
+def read_until(driver: XsensDriver, samples: int = 0, events: int = 0) -> tuple[list[Received], list[Sample]]:
+    """Read until so many samples and events came."""
+    stop = Event()
+    received = []
+    for one in driver.read(stop):
+        received.append(one)
+        if (
+            sum(len(part.samples) for part in received) >= samples
+            and sum(len(part.events) for part in received) >= events
+        ):
+            stop.set()
+    return received, [sample for part in received for _, sample in part.samples]
+
+
+def all_events(received: list[Received]) -> list[DeviceEvent]:
+    return [event for part in received for event in part.events]
+
+
+def test_handshake_and_measurement(device: PtyDevice) -> None:
+    second = measurement(2, 50)
+    device.answers[GO_TO_MEASUREMENT] += measurement(1, 25) + second[:10]
+    driver = make_driver(device.port)
+    driver.connect()
+    assert driver.identity == {"serial": "01234567", "firmware": "1.8.2"}
+    assert device.asked == [GO_TO_CONFIG, REQUEST_DEVICE_ID, REQUEST_FIRMWARE, SET_OUTPUTS, GO_TO_MEASUREMENT]
+    device.send(second[10:] + measurement(3, 75))
+    received, samples = read_until(driver, samples=3)
+    assert [sample.device_ticks for sample in samples] == [25, 50, 75]
+    chunks = [chunk for part in received for chunk in part.chunks]
+    assert b"".join(chunk.data for chunk in chunks if not chunk.sent) == device.sent
+    assert b"".join(chunk.data for chunk in chunks if chunk.sent) == b"".join(device.asked)
+    assert [chunk.arrival_ns for chunk in chunks] == sorted(chunk.arrival_ns for chunk in chunks)
+    for part in received[1:]:
+        assert all(arrival_ns == part.chunks[0].arrival_ns for arrival_ns, _ in part.samples)
+    assert all_events(received) == []
+    (stream,) = driver.streams
+    assert (stream.kind, stream.rate_hz) == ("imu", 400)
+    driver.close()
+    driver.close()
+
+
+def test_gap_event_from_the_packet_counter(device: PtyDevice) -> None:
+    driver = make_driver(device.port)
+    driver.connect()
+    device.send(measurement(1, 25) + measurement(5, 125))
+    received, samples = read_until(driver, samples=2, events=1)
+    assert len(samples) == 2
+    assert [(event.kind, event.count) for event in all_events(received)] == [("gap", 3)]
+    driver.close()
+
+
+def test_hang_up_is_a_device_error(device: PtyDevice) -> None:
+    driver = make_driver(device.port)
+    driver.connect()
+    reading = driver.read(Event())
+    next(reading)
+    device.hang_up()
+    with pytest.raises(DeviceError, match="device is gone"):
+        next(reading)
+    driver.close()
+
+
+def test_lost_request_is_sent_again(device: PtyDevice, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(xsens, "ANSWER_S", 0.05)
+    answer = device.answers.pop(GO_TO_CONFIG)
+    device.answers[GO_TO_CONFIG * 2] = answer
+    driver = make_driver(device.port)
+    driver.connect()
+    assert device.asked[0] == GO_TO_CONFIG * 2
+    driver.close()
+
+
+def test_no_answer_names_port_baud_and_message(device: PtyDevice, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(xsens, "ANSWER_S", 0.02)
+    del device.answers[REQUEST_FIRMWARE]
+    driver = make_driver(device.port)
+    with pytest.raises(
+        DeviceError, match=rf"{device.port} at 460800 baud: no answer to ReqFWRev \(3 tries.*nothing came"
+    ):
+        driver.connect()
+    device.answers[REQUEST_FIRMWARE] = ANSWERS[REQUEST_FIRMWARE]
+    driver.connect()  # the port was released
+    driver.close()
+
+
+def test_refusal_is_told_in_words(device: PtyDevice) -> None:
+    device.answers[SET_OUTPUTS] = bytes.fromhex("FAFF4201219D")
+    with pytest.raises(DeviceError, match=r"SetOutputConfiguration was refused .* parameter invalid"):
+        make_driver(device.port).connect()
+
+
+def test_other_accepted_rates_are_warned_of(device: PtyDevice) -> None:
+    granted = bytes.fromhex("1020FFFF 1060FFFF 40200064 80200064 0810000A")
+    device.answers[SET_OUTPUTS] = frame(0xC1, granted)
+    driver = make_driver(device.port)
+    driver.connect()
+    received, _ = read_until(driver)
+    texts = [event.text.split(": ", 1)[1] for event in all_events(received)]
+    assert texts == [
+        "acceleration: asked for 400 Hz, the device gives 100 Hz",
+        "rate of turn: asked for 400 Hz, the device gives 100 Hz",
+        "the device gives no magnetic field",
+    ]
+    assert driver.streams[0].rate_hz == 100
+    driver.close()
+
+
+def test_refused_acceleration_is_an_error(device: PtyDevice) -> None:
+    device.answers[SET_OUTPUTS] = frame(0xC1, bytes.fromhex("1020FFFF 1060FFFF 80200190"))
+    with pytest.raises(DeviceError, match="did not accept acceleration at 400 Hz"):
+        make_driver(device.port).connect()
+
+
+def test_unconfigured_device_is_listened_to(device: PtyDevice) -> None:
+    driver = make_driver(device.port, configure=False, baud=9600)
+    driver.connect()
+    device.send(EXAMPLE)
+    _, samples = read_until(driver, samples=1)
+    assert len(samples) == 1
+    assert device.asked == []
+    driver.close()
+
+
+def test_absent_port_is_named() -> None:
+    with pytest.raises(DeviceError, match=r"/dev/nowhere: cannot open at 460800 baud: No such file"):
+        make_driver("/dev/nowhere").connect()
+
+
+def test_line_too_slow_for_the_rate() -> None:
+    with pytest.raises(DeviceError, match=r"400 Hz need 20370 bytes/s.*rate_hz 100 or less or baud 230400 or more"):
+        make_driver("/dev/nowhere", baud=115200).connect()
+
+
+class ScriptedLink:
+    """Reads come from a list of (arrival in seconds, bytes)."""
+
+    def __init__(self, reads: list[tuple[float, bytes]]) -> None:
+        self.reads = iter(reads)
+
+    def read(self, timeout_s: float) -> tuple[int, bytes]:
+        arrival_s, data = next(self.reads)
+        return round(arrival_s * 1e9), data
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, reads: list[tuple[float, bytes]]) -> Iterator[Received]:
+    monkeypatch.setattr(xsens, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    driver = make_driver("/dev/ttyX", configure=False)
+    driver.connect()
+    return driver.read(Event())
+
+
+def test_silence_is_a_device_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading = scripted(monkeypatch, [(9.0, b""), (10.0, EXAMPLE), (12.9, b""), (13.1, b"")])
+    assert next(reading) == Received()
+    assert len(next(reading).samples) == 1
+    with pytest.raises(DeviceError, match=r"/dev/ttyX at 460800 baud: no data for 3 s"):
+        next(reading)
+
+
+def test_bytes_without_frames_are_warned_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    garbage: list[tuple[float, bytes]] = [(10 + i / 2, b"\xf5\x00\xff") for i in range(12)]
+    reading = scripted(monkeypatch, [*garbage, (16.0, EXAMPLE), (16.1, b"\0" * 7), (17.2, EXAMPLE)])
+    parts = [next(reading) for _ in range(16)]
+    assert [(event.kind, event.count) for event in all_events(parts)] == [("warning", 0), ("garbage", 7)]
+    assert "no Xsens frame for 3 s" in all_events(parts)[0].text
+    assert parts[1].chunks == (Chunk(10_000_000_000, b"\xf5\x00\xff"),)
