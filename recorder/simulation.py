@@ -28,7 +28,7 @@ class SimulatedRig:
     def __init__(self, rig: Path | None, settings: tuple[str, ...]) -> None:
         """Start and wait until it is ready. Raises ConfigError for wrong settings, RecorderError if it fails."""
         # A session of its own: Ctrl-C on the terminal must stop the recorder first, the devices after it.
-        self._messages = tempfile.TemporaryFile("w+")  # a pipe that nobody reads would block it
+        self._messages = tempfile.TemporaryFile("w+")  # noqa: SIM115 - a pipe that nobody reads would block it
         self._process = subprocess.Popen(
             command(rig, settings),
             stdout=subprocess.PIPE,

@@ -17,10 +17,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: a process pe
 import cv2
 import yaml
 
-from recorder.errors import ConfigError
+from recorder.errors import ConfigError, RecorderError
+from simulated_devices.ideal import write_ideal
 from simulated_devices.rig import DeviceDiedError, Simulation, read_rig
 
-EXIT_DEVICE_DIED = 1
+EXIT_FAILED = 1
 EXIT_WRONG_USE = 2
 
 
@@ -31,12 +32,17 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("rig", nargs="?", type=Path, metavar="RIG.yaml", help="default: the built-in rig")
     parser.add_argument("--set", action="append", default=[], metavar="key=value", help="set a key path of the rig")
+    parser.add_argument("--ideal", type=Path, metavar="DIR", help="write the same world straight to a recording")
+    parser.add_argument("--duration", type=float, default=30.0, metavar="S", help="seconds of it (with --ideal)")
     parser.add_argument("--report", action="store_true", help="at the end, say what was sent and how timely")
     options = parser.parse_args(arguments)
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     cv2.setNumThreads(1)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
+        if options.ideal is not None:
+            write_ideal(read_rig(options.rig, tuple(options.set)), options.ideal, options.duration)
+            return 0
         with Simulation(read_rig(options.rig, tuple(options.set)), report=options.report) as simulation:
             yaml.safe_dump(simulation.document, sys.stdout, sort_keys=False, explicit_end=True)
             sys.stdout.flush()
@@ -46,9 +52,9 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return EXIT_WRONG_USE
-    except DeviceDiedError as error:
+    except (DeviceDiedError, RecorderError) as error:
         sys.stderr.write(f"{error}\n")
-        return EXIT_DEVICE_DIED
+        return EXIT_FAILED
     return 0
 
 

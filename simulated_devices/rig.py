@@ -173,7 +173,7 @@ class UdpPorts:
         return bound
 
 
-class _Cast:
+class Cast:
     """Makes the devices of a rig around one world."""
 
     def __init__(self, settings: SimulateSettings) -> None:
@@ -251,7 +251,7 @@ class Simulation:
         entries = source.get("devices")
         if not isinstance(entries, dict) or not entries:
             raise ConfigError("devices: a mapping of at least one device is needed")
-        cast = _Cast(simulate_settings(source))
+        cast = Cast(simulate_settings(source))
         self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]
         self._cameras = cast.cameras
         self._stage = cast.stage

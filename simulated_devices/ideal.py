@@ -1,0 +1,227 @@
+"""The ideal twin of a simulated recording: the same world and seed written straight to disk with the true times.
+
+No device, link or clock is in between, so what a take of the simulated rig loses against its twin is the cost of the
+way through them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from heapq import merge
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.samples import POINT_DTYPE, FixSample, FrameSample, ImuSample, PoseSample, ScanSample, VideoFormat
+from recorder.errors import ConfigError, RecorderError, StorageError
+from recorder.recording.manifest import DeviceSummary, StreamSummary
+from recorder.recording.writer import RecordingWriter, new_manifest
+from simulated_devices.camera import ClientStream, PictureEncoder
+from simulated_devices.nmea import ORIGIN, SIGMA_M
+from simulated_devices.pose import quaternion
+from simulated_devices.rig import Cast, calibration, simulate_settings
+from simulated_devices.robosense import IMU_FROM_LIDAR
+from simulated_devices.scene import CameraRenderer, M1Scanner, PinholeCamera
+from simulated_devices.timing import SECOND_NS, random_for
+from simulated_devices.world import ImuNoise, NoisyImu, magnetometer_ut
+
+WORLD_BEFORE_START_S = 1.0  # a take begins about so long before the world does
+TWIN_UTC_NS = 1_767_225_600 * SECOND_NS  # a date, so that the same seed gives the same files
+FRAMES_AFTER_IMU_NS = 1_100_000  # pictures do not fall on IMU samples, as with real devices
+RADIUS_UNIT_M = np.float32(0.005)
+ANGLE_ZERO = 32768
+BATCH = 100
+PROGRESS_NS = 5 * SECOND_NS
+
+Item = tuple[int, int, str, Any]  # time, order of adding, device, sample
+
+
+class _NoClient(ClientStream):
+    """Swallows the container: only the packets are wanted."""
+
+    def __init__(self) -> None:
+        self.gone = False
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+
+class Twin:
+    """Samples of all devices of a rig at their true times."""
+
+    def __init__(self, source: dict[str, Any], duration_s: float) -> None:
+        """Raises ConfigError."""
+        entries = source.get("devices")
+        if not isinstance(entries, dict) or not entries:
+            raise ConfigError("devices: a mapping of at least one device is needed")
+        self._cast = Cast(simulate_settings(source))
+        self._devices = {str(name): self._cast.device(str(name), entry) for name, entry in entries.items()}
+        self._duration_ns = round(duration_s * SECOND_NS)
+        self.entries: dict[str, dict[str, Any]] = entries
+        self.cameras = [name for name, entry in entries.items() if entry["driver"] == "stream"]
+        self.calibration = calibration(self._cast.cameras)
+        makers = {
+            "xsens": self._imu,
+            "nmea": self._gnss,
+            "robosense": self._lidar,
+            "stream": self._camera,
+            "pose": self._pose,
+        }
+        self._streams = [makers[entry["driver"]](order, name) for order, (name, entry) in enumerate(entries.items())]
+
+    def items(self) -> Iterator[Item]:
+        """All samples in time order."""
+        return merge(*self._streams, key=lambda item: item[:2])
+
+    def _times(self, rate_hz: float, first_ns: int) -> Iterator[np.ndarray[Any, np.dtype[np.int64]]]:
+        count = int((self._duration_ns - first_ns) * rate_hz / SECOND_NS) + 1
+        for begin in range(0, count, BATCH):
+            index = np.arange(begin, min(begin + BATCH, count))
+            times_ns = first_ns + np.rint(index * (SECOND_NS / rate_hz)).astype(np.int64)
+            yield times_ns[times_ns < self._duration_ns]
+
+    def _rate_hz(self, name: str, key: str, default: float) -> float:
+        return float(self.entries[name].get(key, default))
+
+    def _imu(self, order: int, name: str) -> Iterator[Item]:
+        rate_hz = self._rate_hz(name, "rate_hz", 400)
+        stage, trajectory = self._cast.stage, self._cast.trajectory
+        imu = NoisyImu(trajectory, ImuNoise(), rate_hz, stage.seed_for("imu", name))
+        for times_ns in self._times(rate_hz, 0):
+            world_s = _world_s(times_ns)
+            gyro, accel = imu.read(world_s)
+            field_ut = magnetometer_ut(trajectory.kinematics(world_s))
+            for index, time_ns in enumerate(times_ns.tolist()):
+                accel_m_s2, gyro_rad_s, mag_ut = (tuple(values[index].tolist()) for values in (accel, gyro, field_ut))
+                yield time_ns, order, name, ImuSample(None, time_ns, accel_m_s2, gyro_rad_s, mag_ut)
+
+    def _pose(self, order: int, name: str) -> Iterator[Item]:
+        for times_ns in self._times(self._rate_hz(name, "rate_hz", 100), 0):
+            rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
+            for index, time_ns in enumerate(times_ns.tolist()):
+                orientation = tuple(quaternion(rotation[index]).tolist())
+                yield time_ns, order, name, PoseSample(None, time_ns, tuple(position_m[index].tolist()), orientation)
+
+    def _gnss(self, order: int, name: str) -> Iterator[Item]:
+        random = random_for(self._cast.stage.seed, "gnss", name)
+        for times_ns in self._times(self._rate_hz(name, "rate_hz", 10), 0):
+            _, position_m = self._cast.trajectory.pose(_world_s(times_ns))
+            north_east_up = random.normal(0.0, SIGMA_M, position_m.shape)
+            latitude, longitude, altitude = ORIGIN.to_geodetic(position_m + north_east_up[:, [1, 0, 2]])
+            for index, time_ns in enumerate(times_ns.tolist()):
+                yield time_ns, order, name, FixSample(
+                    TWIN_UTC_NS + time_ns, 0, float(latitude[index]), float(longitude[index]), float(altitude[index]),
+                    ORIGIN.undulation_m, float(np.hypot(*SIGMA_M[:2])), SIGMA_M[2], "gst", 4, 24, 0.6, 1.0,
+                )  # fmt: skip
+
+    def _camera(self, order: int, name: str) -> Iterator[Item]:
+        camera: PinholeCamera = self._cast.cameras[self.cameras.index(name)]
+        fps = self._rate_hz(name, "fps", 20)
+        renderer = CameraRenderer(self._cast.room, camera, seed=self._cast.stage.seed_for("camera", name))
+        encoder = PictureEncoder(_NoClient(), camera.width, camera.height, fps)
+        video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p", b"")
+        for times_ns in self._times(fps, FRAMES_AFTER_IMU_NS):
+            rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
+            for index, time_ns in enumerate(times_ns.tolist()):
+                picture = renderer.render(rotation[index], position_m[index])
+                packet = encoder.encode(picture, time_ns // 1000)
+                exposure_s = self.entries[name].get("exposure_s")
+                sample = FrameSample(time_ns, bytes(packet), bool(packet.is_keyframe), video, exposure_s)
+                yield time_ns, order, name, sample
+
+    def _lidar(self, order: int, name: str) -> Iterator[Item]:
+        scanner = M1Scanner(self._cast.stage.seed_for("lidar", name))
+        for times_ns in self._times(10, 0):
+            for start_ns in times_ns.tolist():
+                frame = round(start_ns * 10 / SECOND_NS)
+                start_s = float(_world_s(np.array([start_ns]))[0])
+                radius, intensity = scanner.scan(self._cast.room, self._cast.trajectory, start_s, IMU_FROM_LIDAR, frame)
+                points = _points(scanner, start_ns, radius, intensity)
+                if len(points):
+                    last_ns = round(float(points["timestamp"][-1]) * SECOND_NS)
+                    packets = len(radius)
+                    yield last_ns, order, name, ScanSample(points, start_ns, last_ns, packets, packets, 0, False)
+
+
+def _world_s(times_ns: np.ndarray[Any, np.dtype[np.int64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.asarray(times_ns * 1e-9 - WORLD_BEFORE_START_S, dtype=np.float64)
+
+
+def _points(
+    scanner: M1Scanner, start_ns: int, radius: np.ndarray[Any, Any], intensity: np.ndarray[Any, Any]
+) -> np.ndarray[Any, np.dtype[np.void]]:
+    """The points of a frame that returned, (n,) POINT_DTYPE, timestamp in seconds of recording time."""
+    distance = radius.astype(np.float32) * RADIUS_UNIT_M
+    pitch = np.radians((scanner.pitch_raw.astype(np.float32) - ANGLE_ZERO) / 100)
+    yaw = np.radians((scanner.yaw_raw.astype(np.float32) - ANGLE_ZERO) / 100)
+    points = np.zeros(radius.shape, dtype=POINT_DTYPE)
+    points["x"] = distance * np.cos(pitch) * np.cos(yaw)
+    points["y"] = distance * np.cos(pitch) * np.sin(yaw)
+    points["z"] = distance * np.sin(pitch)
+    points["intensity"] = intensity
+    points["ring"] = np.arange(radius.shape[2])
+    offset_s = scanner.packet_offset_s[:, None] + scanner.block_offset_us * 1e-6
+    points["timestamp"] = (start_ns * 1e-9 + offset_s)[:, :, None]
+    returned: np.ndarray[Any, np.dtype[np.void]] = points[radius > 0]
+    return returned
+
+
+def write_ideal(source: dict[str, Any], folder: Path, duration_s: float) -> None:
+    """Write the twin of a rig into a folder that is empty or not there yet. Raises RecorderError."""
+    if folder.exists() and any(folder.iterdir()):
+        raise StorageError(f"{folder}: is not empty; choose another folder")
+    twin = Twin(source, duration_s)
+    folder.mkdir(parents=True, exist_ok=True)
+    errors: list[str] = []
+    kinds = {"xsens": "imu", "nmea": "gnss", "robosense": "lidar", "stream": "frames", "pose": "pose"}
+    rates = {"imu": ("rate_hz", 400), "gnss": ("rate_hz", 10), "frames": ("fps", 20), "pose": ("rate_hz", 100)}
+    devices = {}
+    for name, entry in twin.entries.items():
+        kind = kinds[entry["driver"]]
+        rate_hz = float(entry.get(*rates[kind])) if kind in rates else 10.0
+        devices[name] = DeviceSummary(entry["driver"], "true time", 0.0, {}, StreamSummary(kind, rate_hz))
+    manifest = new_manifest(
+        folder.name, start_monotonic_ns=0, utc_ns=TWIN_UTC_NS, utc_source="simulated", cameras=twin.cameras,
+        devices=devices, clocks={}, rig=source,
+    )  # fmt: skip
+    writer = RecordingWriter(
+        folder,
+        manifest,
+        calibration=(json.dumps(twin.calibration, indent=2) + "\n").encode() if twin.cameras else None,
+        lidar=any(device.stream.kind == "lidar" for device in devices.values()),
+        raw=False,
+        on_error=lambda name, error: errors.append(f"{name}: {error}"),
+    )
+    _write_items(twin, writer, devices, round(duration_s * SECOND_NS))
+    errors += writer.close(round(duration_s * SECOND_NS), "duration")
+    if errors:
+        raise RecorderError(f"{folder}: {'; '.join(errors)}")
+
+
+def _write_items(twin: Twin, writer: RecordingWriter, devices: dict[str, DeviceSummary], duration_ns: int) -> None:
+    pictures: dict[str, FrameSample] = {}
+    told_ns = 0
+    for time_ns, _, name, sample in twin.items():
+        counts = devices[name].stream
+        counts.received += 1
+        if isinstance(sample, FrameSample):
+            pictures[name] = sample
+            if len(pictures) == len(twin.cameras):
+                writer.write_frames(time_ns, [pictures.pop(camera) for camera in twin.cameras])
+            continue
+        counts.written += 1
+        if isinstance(sample, ImuSample):
+            writer.write_imu(time_ns, sample)
+        elif isinstance(sample, PoseSample):
+            writer.write_pose(time_ns, str(twin.entries[name].get("name", "groundTruth")), sample)
+        elif isinstance(sample, FixSample):
+            writer.write_fix(time_ns, sample)
+        elif isinstance(sample, ScanSample):
+            point_time_ns = np.rint(sample.points["timestamp"] * SECOND_NS).astype(np.int64)
+            writer.write_scan(time_ns, sample.model, sample, point_time_ns)
+        if time_ns - told_ns >= PROGRESS_NS:
+            told_ns = time_ns
+            sys.stderr.write(f"{time_ns / SECOND_NS:.0f} of {duration_ns / SECOND_NS:.0f} s written\n")
