@@ -7,6 +7,7 @@ choice and order that may differ from frame to frame.
 
 import math
 import struct
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -15,6 +16,7 @@ from drivers.samples import ImuSample, Vector
 PREAMBLE = b"\xfa\xff"
 MTDATA2 = 0x36
 MAX_PAYLOAD_BYTES = 2048
+MAX_REPLIES = 64
 
 ITEM_MASK = 0xF8F0  # leaves out the coordinate system (bits 3..2) and the number format (bits 1..0)
 PACKET_COUNTER = 0x1020
@@ -106,16 +108,17 @@ class XbusFramer:
 
 @dataclass(slots=True)
 class Mtdata2Decoder:
-    """Measurements out of an XBus stream; frames that are none (answers, errors) are passed over.
+    """Measurements out of an XBus stream.
 
     magnetic_field_ut: strength of the local field in µT: the device's magnetometer unit is about one local field.
     lost_messages: holes in the packet counter, measurements without inertial data included.
-    frames: how many frames came, of any kind.
+    frames: how many frames came, of any kind. replies: the latest that are no measurement, for who cares to take them.
     """
 
     magnetic_field_ut: float = 50.0
     lost_messages: int = 0
     frames: int = 0
+    replies: deque[Frame] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
     framer: XbusFramer = field(default_factory=XbusFramer)
     _counter: int | None = None
     _ticks: int | None = None
@@ -140,6 +143,7 @@ class Mtdata2Decoder:
         samples: list[ImuSample] = []
         for message_id, payload in frames:
             if message_id != MTDATA2:
+                self.replies.append((message_id, payload))
                 continue
             sample = decode_mtdata2(payload, self.magnetic_field_ut)
             self._count_lost(sample)

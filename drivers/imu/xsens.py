@@ -37,6 +37,7 @@ REQUEST_DEVICE_ID = ("ReqDID", 0x00)
 REQUEST_FIRMWARE = ("ReqFWRev", 0x12)
 SET_OUTPUT_CONFIGURATION = ("SetOutputConfiguration", 0xC0)
 GO_TO_MEASUREMENT = ("GoToMeasurement", 0x10)
+WAKE_UP = 0x3E
 ERROR = 0x42
 ERROR_TEXTS = {
     0x03: "period outside of the valid range",
@@ -214,8 +215,7 @@ class _Dialogue:
                     self.left_over = frames[index + 1 :]
                     return payload
                 if came_id == ERROR:
-                    code = payload[0] if payload else 0
-                    self._refusal = f"error {code}, {ERROR_TEXTS.get(code, 'unknown code')}"
+                    self._refusal = _error_text(payload)
                     return None
         return None
 
@@ -241,7 +241,15 @@ class _Care:
             self._heard_ns = arrival_ns
         elif arrival_ns - self._heard_ns > SILENCE_NS:
             raise DeviceError(f"{self.where}: no data for {SILENCE_S:g} s")
-        return (*self._no_frames(arrival_ns), *self._gaps(), *self._bad_input(arrival_ns))
+        return (*self._replies(), *self._no_frames(arrival_ns), *self._gaps(), *self._bad_input(arrival_ns))
+
+    def _replies(self) -> Iterator[DeviceEvent]:
+        while self.decoder.replies:
+            message_id, payload = self.decoder.replies.popleft()
+            if message_id == ERROR:
+                yield DeviceEvent("warning", f"{self.where}: the device reports {_error_text(payload)}")
+            elif message_id == WAKE_UP:
+                yield DeviceEvent("warning", f"{self.where}: the device has started anew")
 
     def _no_frames(self, arrival_ns: int) -> Iterator[DeviceEvent]:
         if self.decoder.frames != self._frames:
@@ -333,6 +341,11 @@ def _accepted(asked: dict[int, int], answer: bytes, where: str) -> tuple[int, tu
         elif rate_hz not in (EVERY_MESSAGE, granted_hz):
             warnings.append(f"{where}: {name}: asked for {rate_hz} Hz, the device gives {granted_hz} Hz")
     return min(granted[ACCELERATION], granted[RATE_OF_TURN]), tuple(DeviceEvent("warning", text) for text in warnings)
+
+
+def _error_text(payload: bytes) -> str:
+    code = payload[0] if payload else 0
+    return f"error {code}, {ERROR_TEXTS.get(code, 'of unknown meaning')}"
 
 
 def _stamped(arrival_ns: int, samples: list[ImuSample]) -> tuple[tuple[int, Sample], ...]:

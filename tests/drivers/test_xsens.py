@@ -445,3 +445,12 @@ def test_bytes_without_frames_are_warned_of_once(monkeypatch: pytest.MonkeyPatch
     assert [(event.kind, event.count) for event in all_events(parts)] == [("warning", 0), ("garbage", 7)]
     assert "no Xsens frame for 3 s" in all_events(parts)[0].text
     assert parts[1].chunks == (Chunk(10_000_000_000, b"\xf5\x00\xff"),)
+
+
+def test_errors_and_restarts_of_the_device_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    overflow, wake_up = bytes.fromhex("FAFF42012995"), bytes.fromhex("FAFF3E00C3")
+    reading = scripted(monkeypatch, [(1.0, EXAMPLE + overflow), (1.1, wake_up + EXAMPLE)])
+    events = all_events([next(reading) for _ in range(3)])
+    assert [event.kind for event in events] == ["warning", "warning"]
+    assert "error 41, more data than the baud rate carries" in events[0].text
+    assert "started anew" in events[1].text
