@@ -92,6 +92,22 @@ def test_sentences_between_binary_messages() -> None:
     assert (whole.bad_frames, whole.skipped_bytes) == (0, 0)
 
 
+# The example message 1005 of the RTCM 3 standard.
+RTCM_1005 = bytes.fromhex("D300133ED7D30202980EDEEF34B4BD62AC0941986F33360B98")
+
+
+def test_whole_binary_messages_are_stepped_over() -> None:
+    body = b"\x05\x00" + len(gga()).to_bytes(2, "little") + gga("110000.00")  # a UBX message that holds a sentence
+    first = second = 0
+    for byte in body:
+        first = first + byte & 0xFF
+        second = second + first & 0xFF
+    decoder = NmeaDecoder(utc_ns(NOON))
+    fixes = decoder.feed(RTCM_1005 + gga() + b"\xb5b" + body + bytes((first, second)) + RTCM_1005) + decoder.flush()
+    assert [fix.device_ticks for fix in fixes] == [utc_ns(NOON)]
+    assert (decoder.bad_frames, decoder.skipped_bytes) == (0, 0)
+
+
 def test_fix_of_an_epoch() -> None:
     (fix,) = decode(b"\xff\x00" + rmc() + gga(quality=4) + gst())
     assert fix == FixSample(

@@ -176,6 +176,8 @@ def test_gnss_packets_count_in_the_sequence() -> None:
     samples = decoder.feed(measurement(1, 9000) + measurement(2, 800, inertial=False) + measurement(3, 9025))
     assert [sample.sequence for sample in samples] == [1, 3]
     assert decoder.lost_messages == 0
+    decoder.feed(measurement(5, 900, inertial=False))
+    assert decoder.lost_messages == 1
 
 
 STREAM = b"\x36\xfa" + EXAMPLE + b"\xfa\xff" + EXAMPLE[:20] + EXAMPLE + b"\xfa\xff\x36\xff\x20\x20" + EXAMPLE * 2
