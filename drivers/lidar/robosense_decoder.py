@@ -78,9 +78,19 @@ M1 = MemsModel(
 """M1 and M1P: the same packets."""
 
 
+def is_measurement(datagram: bytes, model: MemsModel = M1) -> bool:
+    """Whether it has the length and magic of the model's measurement packet (MSOP)."""
+    return len(datagram) == model.packet_bytes and datagram.startswith(model.magic)
+
+
+def is_difop(datagram: bytes) -> bool:
+    """Whether it has the length and magic of an information packet (DIFOP)."""
+    return len(datagram) == DIFOP_BYTES and datagram.startswith(DIFOP_MAGIC)
+
+
 def packet_ticks(datagram: bytes, model: MemsModel = M1) -> int | None:
     """Device time of a measurement packet in microseconds, None when it is no such packet."""
-    if len(datagram) != model.packet_bytes or not datagram.startswith(model.magic):
+    if not is_measurement(datagram, model):
         return None
     _, _, upper, lower, microseconds = HEADER.unpack_from(datagram)
     seconds = upper << 32 | lower
@@ -322,10 +332,10 @@ class M1Decoder:
 
     def feed(self, datagram: bytes) -> list[ScanSample]:
         """Take one datagram; gives the frames it closes."""
-        if len(datagram) == DIFOP_BYTES and datagram.startswith(DIFOP_MAGIC):
+        if is_difop(datagram):
             self.difop = datagram
             return []
-        if len(datagram) != self.model.packet_bytes or not datagram.startswith(self.model.magic):
+        if not is_measurement(datagram, self.model):
             return self._refuse(datagram)
         sequence, mode, upper, lower, microseconds = HEADER.unpack_from(datagram)
         seconds = upper << 32 | lower
