@@ -140,9 +140,13 @@ def calibration(cameras: list[PinholeCamera]) -> dict[str, Any]:
 
 
 class UdpPorts:
-    """Hands out UDP ports that nobody else uses, nor another simulation on this host."""
+    """Hands out UDP ports that nobody else uses, nor another simulation on this host.
+
+    changes: where another port was taken than the one asked for, in words.
+    """
 
     def __init__(self) -> None:
+        self.changes: list[str] = []
         self._held: list[socket.socket] = []
 
     def take(self, where: str, wanted: int) -> int:
@@ -153,8 +157,13 @@ class UdpPorts:
         while (free := self._free(port)) is None:
             port = 0
         if wanted not in (0, free):
-            log.warning("%s: UDP port %d is in use, taking %d", where, wanted, free)
+            self.changes.append(f"{where}: UDP port {wanted} is in use, taking {free}")
         return free
+
+    def close(self) -> None:
+        """Let go of the ports."""
+        for mark in self._held:
+            mark.close()
 
     def _free(self, port: int) -> int | None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
@@ -184,7 +193,7 @@ class Cast:
         self.room = Room(settings.seed)
         self.stage = Stage(settings.seed, settings.jitter, settings.skew_ppm)
         self.cameras: list[PinholeCamera] = []
-        self._ports = UdpPorts()
+        self.ports = UdpPorts()
         self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
             "xsens": self._xsens,
             "nmea": self._nmea,
@@ -236,7 +245,7 @@ class Cast:
         return PoseSimulator(name, settings, self.stage, self.trajectory)
 
     def _with_ports(self, name: str, settings: Settings, keys: tuple[str, ...]) -> Settings:
-        ports = {key: self._ports.take(f"devices.{name}.{key}", getattr(settings, key)) for key in keys}
+        ports = {key: self.ports.take(f"devices.{name}.{key}", getattr(settings, key)) for key in keys}
         return msgspec.structs.replace(settings, **ports)
 
 
@@ -252,8 +261,13 @@ class Simulation:
         if not isinstance(entries, dict) or not entries:
             raise ConfigError("devices: a mapping of at least one device is needed")
         cast = Cast(simulate_settings(source))
-        self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]
+        try:
+            self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]
+        except ConfigError:
+            cast.ports.close()
+            raise
         self._cameras = cast.cameras
+        self._ports = cast.ports
         self._stage = cast.stage
         self._source = source
         self._report = report
@@ -293,6 +307,8 @@ class Simulation:
                 self._stage.start()
 
     def _open(self) -> dict[str, Any]:
+        for change in self._ports.changes:
+            log.warning("%s", change)
         document = dict(self._source)
         document["devices"] = {
             device.name: {**self._source["devices"][device.name], **device.open(self._folder)}
@@ -326,6 +342,7 @@ class Simulation:
             if process.is_alive():
                 process.kill()
                 process.join()
+        self._ports.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
