@@ -90,7 +90,7 @@ class CoarseRoom:
 
 
 # Patches of each size class: shortest and longest side in metres, and how many to paint per square metre.
-_PATCHES = ((0.40, 1.20, 1.5), (0.12, 0.40, 12.0), (0.04, 0.13, 110.0), (0.018, 0.05, 420.0))
+_PATCHES = ((0.40, 1.20, 1.5), (0.12, 0.40, 9.0), (0.05, 0.14, 30.0), (0.02, 0.06, 50.0))
 
 
 def _wallpaper(rows: int, columns: int, generator: np.random.Generator) -> Image:
@@ -108,8 +108,8 @@ def _wallpaper(rows: int, columns: int, generator: np.random.Generator) -> Image
         quads = np.stack([center + along + aside, center - along + aside, center - along - aside,
                           center + along - aside], axis=1)  # fmt: skip
         grays = generator.integers(25, 231, count).tolist()
-        for quad, gray in zip(np.rint(quads).astype(np.int32), grays, strict=True):
-            cv2.fillConvexPoly(picture, quad, gray)
+        for quad, gray in zip(np.rint((quads - 0.5) * 16).astype(np.int32), grays, strict=True):
+            cv2.fillConvexPoly(picture, quad, gray, cv2.LINE_AA, 4)
     shade = np.zeros((rows, columns), dtype=np.float32)
     for cell, strength in ((4, 5.0), (16, 8.0), (128, 14.0)):
         grid = generator.standard_normal((rows // cell + 2, columns // cell + 2), dtype=np.float32)
