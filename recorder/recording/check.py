@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibration.model import Calibration, CalibrationError, load_calibration, validate
 from recorder.recording.check_data import DataCheck, Finding, Findings, Progress, file_size, path_inside
@@ -73,9 +73,9 @@ def check(folder: Path, deep: bool = False, progress: Progress = lambda done: No
     videos = _check_videos(folder, data, calibration, deep, findings)
     _check_left_over(folder, data.scan_files, findings)
     if manifest:
-        _check_devices(manifest, findings)
         _check_events(folder, findings)
-        if manifest.state != "recording":
+        if manifest.state != "recording":  # before the end, the manifest does not know
+            _check_devices(manifest, findings)
             _check_counts(manifest, data, findings)
             _check_files(folder, manifest, deep, findings)
     streams = [
@@ -280,7 +280,16 @@ def _check_files(folder: Path, manifest: Manifest, deep: bool, findings: Finding
 
 def print_report(report: Report, console: Console) -> None:
     """The report for people: streams, videos, findings, verdict."""
-    table = Table("stream", "count", "rate Hz", "expected", "from s", "to s", "gaps", title=escape(report.folder))
+    table = Table(
+        Column("stream", no_wrap=True),
+        "count",
+        "rate Hz",
+        "expected",
+        "from s",
+        "to s",
+        "gaps",
+        title=escape(report.folder),
+    )
     for stream in report.streams:
         rates = ("" if rate is None else f"{rate:.2f}" for rate in (stream.rate_hz, stream.expected_hz))
         span = (f"{stream.first_s:.3f}", f"{stream.last_s:.3f}")

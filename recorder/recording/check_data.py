@@ -73,7 +73,8 @@ class DataCheck:
         self, folder: Path, camera_count: int | None, manifest: Manifest | None, findings: Findings, deep: bool
     ) -> None:
         """camera_count: cameras that every frames line must list; None: as many as the first one does."""
-        self.streams = Streams(_expected_rates(manifest))
+        self._expected_hz = _expected_rates(manifest)
+        self.streams = Streams(self._expected_hz)
         self.pictures: Counter[int] = Counter()
         self.scan_files: set[str] = set()
         self.pose_streams: set[str] = set()
@@ -103,6 +104,9 @@ class DataCheck:
                     self._check_line(number, stream, line, last_s)
         except OSError as error:
             self._findings.add("error", "no-data", DATA_NAME, f"cannot be read: {error.strerror}")
+        if len(self.pose_streams) == 1:  # whatever its name: it is the one pose device's
+            (name,) = self.pose_streams
+            self.streams[name].expected_hz = self._expected_hz.get("groundTruth")
         self.streams.finish()
         progress(1.0)
 

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import UNSET
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from drivers.samples import POINT_DTYPE
 from recorder.errors import StorageError
@@ -166,13 +166,12 @@ def _utc_text(utc_ns: int) -> str:
 def print_info(recording: Info, console: Console) -> None:
     """The same for people."""
     start = f", started {recording.start_utc} (by {recording.utc_source})" if recording.start_utc else ""
-    state = f"{recording.state}, stopped by {recording.stopped_by}" if recording.state else "without recording.json"
-    console.print(
-        f"{recording.name}: {recording.duration_s:.2f} s{start}, {state}, {recording.total_bytes / 1e6:.1f} MB",
-        markup=False,
-        soft_wrap=True,
-    )
-    table = Table("stream", "kind", "count", "rate Hz", "from s", "to s", "lost", "dropped", "late")
+    state = recording.state or "without recording.json"
+    stopped = f", stopped by {recording.stopped_by}" if recording.stopped_by else ""
+    size = f"{recording.total_bytes / 1e6:.1f} MB"
+    headline = f"{recording.name}: {recording.duration_s:.2f} s{start}, {state}{stopped}, {size}"
+    console.print(headline, markup=False, soft_wrap=True)
+    table = Table(Column("stream", no_wrap=True), "kind", "count", "Hz", "from s", "to s", "lost", "dropped", "late")
     for stream in recording.streams:
         rate = "" if stream.rate_hz is None else f"{stream.rate_hz:.2f}"
         losses = ("" if count is None else str(count) for count in (stream.lost, stream.dropped, stream.late))

@@ -203,6 +203,7 @@ class StreamStats:
         median_bin = int(np.searchsorted(np.cumsum(self._step_counts), (steps + 1) // 2))
         return float(self._step_counts[median_bin] / self._step_sums_s[median_bin])
 
+    @np.errstate(over="ignore")  # absurd numbers become infinite, and stand out
     def finish(self) -> None:
         """Work off the samples added since the last time."""
         times_s = np.array(self._times_s)
@@ -276,12 +277,15 @@ def read_video(path: Path, decode: bool = False) -> VideoStats:
                 return stats
             _count_pictures(container, container.streams.video[0], stats, decode)
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        stats.error = str(error)
+        stats.error = getattr(error, "strerror", None) or str(error)
     return stats
 
 
 def _count_pictures(container: InputContainer, stream: VideoStream, stats: VideoStats, decode: bool) -> None:
     context = stream.codec_context
+    if not context:
+        stats.error = "its codec is not known"
+        return
     context.thread_type = "AUTO"
     stats.codec, stats.width_px, stats.height_px = context.name, context.width, context.height
     packets = damaged = 0
