@@ -242,13 +242,13 @@ class _Frame:
     """A frame being filled: one slot for every sequence number it may have.
 
     opener: the packet that opened it, from which the others are measured. follows: something came before it.
-    expected: packets it has when whole, 0 while unknown.
+    whole: number of packets with which it is complete, 0 where that is not certain.
     """
 
     opener: _Packet
     cadence: _Cadence
     follows: bool
-    expected: int
+    whole: int
     slots: list[bytes | None]
     spacing_us: float = 0.0
     received: int = 0
@@ -291,10 +291,10 @@ class M1Decoder:
     was lost or came twice. `spacing` is learnt from the first frame, and again from each; until two packets have
     come, order decides (within a frame, later packets have larger numbers).
 
-    A frame is written when its last slot is filled; if some are missing, when 20 packets of the next frame have come
-    or the one after that begins. Two frames are held at most, and one packet that fits neither them nor the next:
-    such a packet is bad, unless the one after it agrees with it. Then either whole frames are missing (counted), or
-    the lidar's clock has jumped and frames start over (`restarts`).
+    A frame is written when all its slots are filled (known for the model's number of packets and a given one only);
+    else when 20 packets of the next frame have come or the one after that begins. Two frames are held at most, and one
+    packet that fits neither them nor the next: it is bad, unless the one after it agrees with it. Then either whole
+    frames are missing (counted), or the lidar's clock has jumped and frames start over (`restarts`).
 
     **Packets of a frame.** The largest sequence number of the last ten frames of this return mode. As long as there
     were fewer, the model's number (630, dual 1260) counts as one of them, if the spacing of the packets fits it
@@ -381,11 +381,12 @@ class M1Decoder:
 
     def _close_full(self, newest: _Frame) -> list[ScanSample]:
         """Write the frames that are whole, and the older one when the newest has come far enough."""
-        is_whole = newest.received == newest.expected
+        is_whole = newest.received == newest.whole
         scans: list[ScanSample] = []
         older = self._older
-        if older and (is_whole or newest.received >= REORDER_PACKETS or older.received == older.expected):
+        if older and (is_whole or newest.received >= REORDER_PACKETS or older.received == older.whole):
             scans = self._emit(older)
+            newest.whole = self._packets_when_whole(newest)  # the older one may have taught it
         return scans + self._emit(newest) if is_whole else scans
 
     def _set_aside(self, packet: _Packet, frames_after: int | None) -> list[ScanSample]:
@@ -411,8 +412,14 @@ class M1Decoder:
     def _open(self, packet: _Packet, follows: bool) -> _Frame:
         cadence = self._cadences[packet.is_dual]
         frame = _Frame(packet, cadence, follows, 0, [None] * (self._largest_sequence + 1))
-        frame.expected = self._frame_packets(frame)
+        frame.whole = self._packets_when_whole(frame)
         return frame
+
+    def _packets_when_whole(self, frame: _Frame) -> int:
+        """Packets that close a frame at once; 0 while its number is only learnt, which may be one too few."""
+        nominal = self.model.packets_per_frame * (2 if frame.opener.is_dual else 1)
+        packets = self._frame_packets(frame)
+        return packets if packets == nominal or self.packets_per_frame is not None else 0
 
     def _frame_packets(self, frame: _Frame) -> int:
         """Packets of a whole frame as far as known, else 0."""
