@@ -27,6 +27,7 @@ EXIT_WRONG_USE = 2
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulated rig; give the exit code."""
+    parent = os.getppid()
     parser = argparse.ArgumentParser(
         prog="python -m simulated_devices", epilog="example: python -m simulated_devices --set simulate.seed=3"
     )
@@ -44,10 +45,13 @@ def main(arguments: list[str] | None = None) -> int:
             write_ideal(read_rig(options.rig, tuple(options.set)), options.ideal, options.duration)
             return 0
         with Simulation(read_rig(options.rig, tuple(options.set)), report=options.report) as simulation:
-            yaml.safe_dump(simulation.document, sys.stdout, sort_keys=False, explicit_end=True)
+            sys.stdout.write(yaml.safe_dump(simulation.document, sort_keys=False, explicit_end=True))
             sys.stdout.flush()
-            simulation.run()
+            simulation.run(parent)
     except KeyboardInterrupt:
+        return 0
+    except BrokenPipeError:  # whoever wanted to read the rig is gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")

@@ -271,7 +271,6 @@ class Simulation:
         self._stage = cast.stage
         self._source = source
         self._report = report
-        self._parent = os.getppid()
         self._processes: dict[str, BaseProcess] = {}
 
     def __enter__(self) -> Simulation:
@@ -289,10 +288,10 @@ class Simulation:
     ) -> None:
         self._end()
 
-    def run(self) -> None:
-        """Keep the world going until the process that started this one is gone. Raises DeviceDiedError."""
+    def run(self, parent: int) -> None:
+        """Keep the world going as long as process `parent` is this one's parent. Raises DeviceDiedError."""
         first_opened_ns: int | None = None
-        while os.getppid() == self._parent:
+        while os.getppid() == parent:
             moving = self._stage.start_ns != 0
             ended = connection.wait([process.sentinel for process in self._processes.values()], 0.1 if moving else 0.02)
             if ended:

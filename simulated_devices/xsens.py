@@ -114,7 +114,7 @@ def encode_values(values: Sequence[float], number_format: int) -> bytes:
 class XbusDevice:
     """The MTi's side of the protocol: bytes in, answers out; readings in, MTData2 out.
 
-    It powers up measuring, with the default outputs at `rate_hz`.
+    It powers up measuring: counter, time, acceleration and rate of turn at `rate_hz`, the slower outputs less often.
     """
 
     def __init__(self, device_id: int, rate_hz: int) -> None:
@@ -125,9 +125,8 @@ class XbusDevice:
             (SAMPLE_TIME_FINE, WITH_EVERY_MESSAGE),
             (ACCELERATION, rate_hz),
             (RATE_OF_TURN, rate_hz),
-            (MAGNETIC_FIELD, rate_hz),
-            (TEMPERATURE, min(rate_hz, 10)),
-            (STATUS_WORD, WITH_EVERY_MESSAGE),
+            (MAGNETIC_FIELD, _fraction_of(rate_hz, 100)),
+            (TEMPERATURE, _fraction_of(rate_hz, 10)),
         ]
         self._device_id = device_id
         self._buffer = bytearray()
@@ -206,6 +205,19 @@ _TIME_AND_STATUS = {PACKET_COUNTER, SAMPLE_TIME_FINE, STATUS_WORD}
 _ITEMS = {*_TIME_AND_STATUS, TEMPERATURE, ACCELERATION, RATE_OF_TURN, MAGNETIC_FIELD}
 
 
+def shortest_message_bytes(rate_hz: int) -> int:
+    """The size of the shortest measurement with the outputs of power-up."""
+    device = XbusDevice(0, rate_hz)
+    reading = Reading(0, (0, 0, 0), (0, 0, 0), (0, 0, 0), 0)
+    messages = (device.message(number, reading) for number in range(BASE_RATE_HZ))
+    return min(len(message) for message in messages if message)
+
+
+def _fraction_of(rate_hz: int, limit_hz: int) -> int:
+    """The highest rate up to the limit whose samples fall on those of `rate_hz`."""
+    return max(rate for rate in range(1, limit_hz + 1) if rate_hz % rate == 0)
+
+
 def _allowed_rate(item: int, rate_hz: int) -> int:
     """The nearest rate the device has that is not above the one asked for; 0 turns the output off."""
     if item & QUANTITY_MASK in _TIME_AND_STATUS:
@@ -254,10 +266,7 @@ class XsensSimulator:
     def open(self, folder: Path) -> dict[str, object]:
         """Make the pty; give the keys a recorder needs."""
         self._pty = Pty(folder / self.name)
-        reading = Reading(0, (0, 0, 0), (0, 0, 0), (0, 0, 0), 0)
-        shortest = len(self._device.message(BASE_RATE_HZ // self._rate_hz, reading))
-        self._device.packet_counter = 0
-        latency_ns = DELAY.floor_ns + self._uart.transmission_ns(shortest)
+        latency_ns = DELAY.floor_ns + self._uart.transmission_ns(shortest_message_bytes(self._rate_hz))
         return {"port": str(self._pty.path), "latency_s": round(latency_ns * 1e-9, 6)}
 
     def close(self) -> None:

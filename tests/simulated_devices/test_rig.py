@@ -98,7 +98,7 @@ def test_the_document_is_the_rig_with_what_a_recorder_needs(simulator):
     document, devices = simulator.document, simulator.devices
     assert document["simulate"] == {"trajectory": "brisk", "seed": 1, "jitter": 1.0, "skew_ppm": 50}
     assert list(devices) == ["imu", "gnss", "lidar", "left", "right", "mocap"]
-    assert devices["imu"]["latency_s"] == pytest.approx(0.0003 + 690 / 921_600, abs=1e-6)
+    assert devices["imu"]["latency_s"] == pytest.approx(0.0003 + 470 / 921_600, abs=1e-6)
     assert devices["gnss"]["latency_s"] == pytest.approx(0.06 + 640 / 115_200, abs=1e-6)
     assert devices["lidar"]["address"] == "127.0.0.1"
     assert devices["mocap"]["clock"] == "imu"

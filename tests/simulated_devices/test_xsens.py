@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from simulated_devices.xsens import Reading, XbusDevice, encode_values, xbus_message
+from simulated_devices.xsens import Reading, XbusDevice, encode_values, shortest_message_bytes, xbus_message
 
 TO_CONFIG = bytes.fromhex("FA FF 30 00 D1")
 TO_MEASUREMENT = bytes.fromhex("FA FF 10 00 F1")
@@ -84,9 +84,10 @@ def test_it_powers_up_measuring_with_all_outputs():
     device = XbusDevice(1, 400)
     assert device.measuring
     message = device.message(1, STILL)
-    assert len(message) == 69
+    assert len(message) == shortest_message_bytes(400) == 47
     assert sum(message[1:]) % 256 == 0
-    assert len(device.message(40, STILL)) == 76  # with the temperature, at 10 Hz
+    assert len(device.message(4, STILL)) == 62  # with the magnetic field, at 100 Hz
+    assert len(device.message(40, STILL)) == 69  # with the temperature, at 10 Hz
 
 
 def test_it_says_who_it_is_in_config_mode_only():
