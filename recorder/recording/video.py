@@ -1,8 +1,10 @@
 """data.mkv, data2.mkv ...: one Matroska file per camera, encoded packets muxed as they came, one thread each.
 
-A picture's ticket is done only when its packet was handed to the file; each packet is its own cluster and flushed, so
-SIGKILL costs at most the picture in flight. The container's time stamps are milliseconds; the exact ones stand in
-data.jsonl, and pictures are matched by order.
+Each packet is its own cluster and flushed, but the muxer writes a cluster only when the next one begins: it holds one
+picture. So a picture's ticket is done when the next picture was muxed, when the file is closed, or when there is no
+next one for IDLE_S (the lines of other devices can't wait longer). SIGKILL costs at most the picture in the muxer.
+
+The container's time stamps are milliseconds; the exact ones stand in data.jsonl, and pictures are matched by order.
 """
 
 import os
@@ -24,6 +26,7 @@ QUEUE_BYTES = 64 << 20
 CRASH_SAFE = {"cluster_time_limit": "1", "flush_packets": "1"}
 MILLISECONDS = Fraction(1, 1000)
 SYNC_PICTURES = 30
+IDLE_S = 0.5
 
 
 def video_name(camera: int) -> str:
@@ -49,6 +52,9 @@ class VideoWriter:
         self._format: VideoFormat | None = None
         self._last_ms = -1
         self._queue: ByteQueue[tuple[int, FrameSample, Ticket]] = ByteQueue(QUEUE_BYTES)
+        self._in_hand: list[tuple[int, FrameSample, Ticket]] = []
+        self._batch: list[tuple[int, FrameSample, Ticket]] = []
+        self._in_muxer: Ticket | None = None
         self._on_error = on_error
         self._thread: threading.Thread = start_thread(path.name, self._run, self._failed)
 
@@ -64,25 +70,38 @@ class VideoWriter:
         descriptor = -1
         try:
             while not self._queue.ended:
-                for time_ns, frame, ticket in self._queue.get_all(0.5):
+                self._batch = self._queue.get_all(IDLE_S)
+                for time_ns, frame, ticket in self._batch:
                     if container is None:
                         container, stream = self._open(frame.video)
                         descriptor = os.open(self._path, os.O_RDONLY)
                     if frame.video.codec != self._codec or self._size != (frame.video.width, frame.video.height):
                         self._refuse(frame.video)
                         ticket.state = "failed"
+                        self._settle(None)
                         continue
                     assert stream is not None
                     container.mux(self._packet(time_ns, frame, stream))
-                    self.pictures += 1
-                    ticket.state = "done"
+                    self._settle(ticket)
                     if self.pictures % SYNC_PICTURES == 0:
                         os.fdatasync(descriptor)
+                if not self._batch:
+                    self._settle(None)
         finally:
             if container is not None:
-                container.close()
-                os.fsync(descriptor)
-                os.close(descriptor)
+                try:
+                    container.close()
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
+        self._settle(None)
+
+    def _settle(self, next_in_muxer: Ticket | None) -> None:
+        """The picture that was in the muxer is in the file."""
+        if self._in_muxer is not None:
+            self._in_muxer.state = "done"
+            self.pictures += 1
+        self._in_muxer = next_in_muxer
 
     def _open(self, video: VideoFormat) -> tuple[OutputContainer, VideoStream]:
         self._path.touch(exist_ok=False)
@@ -126,8 +145,13 @@ class VideoWriter:
     def _failed(self, name: str, error: Exception) -> None:
         """After an error no picture can be written: fail all tickets, so that no line waits for them."""
         self._on_error(name, error)
+        if self._in_muxer is not None:
+            self._in_muxer.state = "failed"
+        for _, _, ticket in self._batch:
+            if ticket.state == "pending":
+                ticket.state = "failed"
         while not self._queue.ended:
-            for _, _, ticket in self._queue.get_all(0.5):
+            for _, _, ticket in self._queue.get_all(IDLE_S):
                 ticket.state = "failed"
 
     def close(self) -> None:
