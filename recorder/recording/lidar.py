@@ -36,6 +36,8 @@ class ScanWriter:
         self._entries: dict[str, FileEntry] = {}
         self._on_error = on_error
         self._queue: ByteQueue[tuple[str, npt.NDArray[np.void], Ticket]] = ByteQueue(QUEUE_BYTES)
+        self._in_hand: list[tuple[str, npt.NDArray[np.void], Ticket]] = []
+        self._batch: list[tuple[str, npt.NDArray[np.void], Ticket]] = []
         self._thread = start_thread("lidar", self._run, self._failed)
 
     def put(self, points: npt.NDArray[np.void]) -> tuple[str, Ticket]:
@@ -49,7 +51,8 @@ class ScanWriter:
     def _run(self) -> None:
         written = 0
         while not self._queue.ended:
-            for name, points, ticket in self._queue.get_all(0.5):
+            self._batch = self._queue.get_all(0.5)
+            for name, points, ticket in self._batch:
                 self._write(self._folder / name, points)
                 self._entries[name] = FileEntry(points.nbytes, hashlib.sha256(points.data).hexdigest())
                 ticket.state = "done"
@@ -66,10 +69,15 @@ class ScanWriter:
         temporary.rename(path)
 
     def _failed(self, name: str, error: Exception) -> None:
+        """After an error no scan can be written: fail all tickets, so that no line waits for them."""
         self._on_error(name, error)
-        while not self._queue.ended:
-            for _, _, ticket in self._queue.get_all(0.5):
+        for _, _, ticket in self._batch:
+            if ticket.state == "pending":
                 ticket.state = "failed"
+        while self._in_hand or not self._queue.ended:
+            for _, _, ticket in self._in_hand:
+                ticket.fail()
+            self._in_hand = self._queue.get_all(0.5)
 
     def close(self) -> dict[str, FileEntry]:
         """Write what is left; gives size and hash of each file."""
