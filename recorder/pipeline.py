@@ -159,11 +159,11 @@ class Pipeline:
         sample = stamped.sample
         config = self._devices[stamped.device].config
         if isinstance(sample, ImuSample):
-            self._writer.write_imu(time_ns, sample, late=late)
+            return self._writer.write_imu(time_ns, sample, late=late)
         elif isinstance(sample, FixSample):
             return self._writer.write_fix(time_ns, sample, late=late)
         elif isinstance(sample, PoseSample):
-            self._writer.write_pose(time_ns, getattr(config, "name", stamped.device), sample, late=late)
+            return self._writer.write_pose(time_ns, getattr(config, "name", stamped.device), sample, late=late)
         elif isinstance(sample, ScanSample):
             if stamped.point_host_ns is None:
                 return False

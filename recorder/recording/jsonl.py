@@ -8,6 +8,7 @@ Key names are those of the data format; extra keys, which its readers ignore: `f
 within `lidar`.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -90,7 +91,7 @@ Pending = bytes | PendingFrames | PendingScan
 
 
 def imu_lines(time_ns: int, sample: ImuSample) -> list[bytes]:
-    """One line per sensor of an IMU sample, accelerometer first."""
+    """One line per sensor of an IMU sample, accelerometer first; none when a value is not a number."""
     time_s = time_ns / NS_PER_S
     sensors = (
         ("accelerometer", sample.accel_m_s2),
@@ -98,16 +99,17 @@ def imu_lines(time_ns: int, sample: ImuSample) -> list[bytes]:
         ("magnetometer", sample.mag_ut),
         ("imuTemperature", None if sample.temperature_k is None else (sample.temperature_k,)),
     )
-    return [
-        encode_json(SensorLine(SensorValues(kind, values), time_s)) for kind, values in sensors if values is not None
-    ]
+    present = [SensorValues(kind, values) for kind, values in sensors if values is not None]
+    if not all(map(math.isfinite, (value for sensor in present for value in sensor.values))):
+        return []
+    return [encode_json(SensorLine(sensor, time_s)) for sensor in present]
 
 
 def fix_line(time_ns: int, fix: FixSample) -> bytes | None:
     """A gps line; None when the fix lacks what the format needs (altitude, accuracies)."""
     if fix.altitude_m is None or fix.accuracy_m is None or fix.vertical_accuracy_m is None:
         return None
-    gps = {
+    gps: dict[str, float] = {
         "latitude": fix.latitude_deg,
         "longitude": fix.longitude_deg,
         "altitude": fix.altitude_m,
@@ -123,12 +125,20 @@ def fix_line(time_ns: int, fix: FixSample) -> bytes | None:
         "accuracySource": fix.accuracy_source,
         "utc": fix.device_ticks / NS_PER_S,
     }
-    known = {key: value for key, value in details.items() if value is not None}
+    if not all(map(math.isfinite, gps.values())):
+        return None
+    known = {key: value for key, value in details.items() if _is_known(value)}
     return encode_json({"gps": gps, "fix": known, "time": time_ns / NS_PER_S})
 
 
-def pose_line(time_ns: int, name: str, pose: PoseSample) -> bytes:
-    """A groundTruth line, or one of a named method."""
+def _is_known(value: object) -> bool:
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def pose_line(time_ns: int, name: str, pose: PoseSample) -> bytes | None:
+    """A groundTruth line, or one of a named method; None when a value is not a number."""
+    if not all(map(math.isfinite, (*pose.position_m, *(pose.orientation_wxyz or ())))):
+        return None
     body: dict[str, object] = {"position": dict(zip("xyz", pose.position_m, strict=True))}
     if pose.orientation_wxyz is not None:
         body["orientation"] = dict(zip("wxyz", pose.orientation_wxyz, strict=True))
@@ -222,9 +232,12 @@ class LineWriter:
         """Write what is left, merge late lines in, make all of it durable; gives size and hash."""
         self._queue.close()
         self._thread.join()
-        entry = self._file.close()
+        try:
+            entry = self._file.close()
+        finally:
+            if self._late_file is not None:
+                self._late_file.close()
         if self._late_file is not None:
-            self._late_file.close()
             entry = merge_late_lines(self._folder)
         return {DATA_NAME: entry}
 

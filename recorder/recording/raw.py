@@ -127,8 +127,8 @@ class RawWriter:
         """Take what one read brought; never waits."""
         if not self._tape or not chunks:
             return
-        size = sum(len(chunk.data) + 64 for chunk in chunks)
-        if not self._queue.offer((device, chunks), size):
+        size = sum(len(chunk.data) for chunk in chunks)
+        if not self._queue.offer((device, chunks), size + 64 * len(chunks)):
             self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + size
 
     def put_pairs(self, device: str, pairs: npt.NDArray[np.int64]) -> None:
@@ -180,4 +180,13 @@ class RawWriter:
         """Write what is left, durably; gives size and hash of each file."""
         self._queue.close()
         self._thread.join()
-        return {name: file.close() for name, file in self._files().items()}
+        entries: dict[str, FileEntry] = {}
+        faults: list[OSError] = []
+        for name, file in self._files().items():
+            try:
+                entries[name] = file.close()
+            except OSError as error:
+                faults.append(error)
+        if faults:
+            raise faults[0]
+        return entries

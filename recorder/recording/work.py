@@ -26,6 +26,11 @@ class Ticket:
         """Pending."""
         self.state = "pending"
 
+    def fail(self) -> None:
+        """The work could not be done; what is done already stays so."""
+        if self.state == "pending":
+            self.state = "failed"
+
 
 class ByteQueue(Generic[T]):
     """A queue bounded by bytes, for one consumer thread.
@@ -115,9 +120,11 @@ class HashedFile:
 
     def close(self) -> FileEntry:
         """Close durably; gives size and hash."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
+        try:
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
         return FileEntry(self._size, self._hash.hexdigest())
 
 

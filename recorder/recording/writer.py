@@ -30,6 +30,7 @@ from recorder.recording.jsonl import (
 from recorder.recording.lidar import ScanWriter
 from recorder.recording.manifest import (
     EVENTS_NAME,
+    MANIFEST_NAME,
     NS_PER_S,
     ClockSummary,
     DeviceSummary,
@@ -67,6 +68,12 @@ class RecordingWriter:
         on_error: OnError,
     ) -> None:
         """Create all files in an existing, empty folder."""
+        self._faults: list[str] = []
+
+        def failed(name: str, error: Exception) -> None:
+            self._faults.append(f"{name}: {error}")
+            on_error(name, error)
+
         self.folder = folder
         self.manifest = manifest
         start_ns = manifest.start_monotonic_ns
@@ -74,21 +81,23 @@ class RecordingWriter:
         if calibration is not None:
             write_atomically(folder / CALIBRATION_NAME, calibration)
         self.events = EventLog(folder / EVENTS_NAME, start_ns)
-        self.raw = RawWriter(folder, manifest.utc_at_time_0.utc_ns - start_ns, on_error, tape=raw)
-        self._lines = LineWriter(folder, on_error)
-        self._scans = ScanWriter(folder, on_error) if lidar else None
+        self.raw = RawWriter(folder, manifest.utc_at_time_0.utc_ns - start_ns, failed, tape=raw)
+        self._lines = LineWriter(folder, failed)
+        self._scans = ScanWriter(folder, failed) if lidar else None
         self.videos = [
-            VideoWriter(folder / video_name(index), on_error, self._refused(camera))
+            VideoWriter(folder / video_name(index), failed, self._refused(camera))
             for index, camera in enumerate(manifest.cameras)
         ]
 
     def _refused(self, camera: str) -> Callable[[str], None]:
         return lambda text: self.events.write(camera, "drop", text)
 
-    def write_imu(self, time_ns: int, sample: ImuSample, *, late: bool = False) -> None:
-        """One line per sensor of the sample."""
-        for line in imu_lines(time_ns, sample):
+    def write_imu(self, time_ns: int, sample: ImuSample, *, late: bool = False) -> bool:
+        """One line per sensor of the sample; False when a value is not a number."""
+        lines = imu_lines(time_ns, sample)
+        for line in lines:
             self._lines.put(line, late=late)
+        return bool(lines)
 
     def write_fix(self, time_ns: int, fix: FixSample, *, late: bool = False) -> bool:
         """A gps line; False when the fix lacks what the format needs."""
@@ -98,9 +107,13 @@ class RecordingWriter:
         self._lines.put(line, late=late)
         return True
 
-    def write_pose(self, time_ns: int, name: str, pose: PoseSample, *, late: bool = False) -> None:
-        """A line with the pose under its name."""
-        self._lines.put(pose_line(time_ns, name, pose), late=late)
+    def write_pose(self, time_ns: int, name: str, pose: PoseSample, *, late: bool = False) -> bool:
+        """A line with the pose under its name; False when a value is not a number."""
+        line = pose_line(time_ns, name, pose)
+        if line is None:
+            return False
+        self._lines.put(line, late=late)
+        return True
 
     def write_scan(
         self,
@@ -127,11 +140,11 @@ class RecordingWriter:
         self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
 
     def close(self, duration_ns: int, stopped_by: str) -> list[str]:
-        """Finish all files; recording.json says complete last of all, unless a file could not be finished.
+        """Finish all files; recording.json says complete last of all, unless a file could not be written or finished.
 
         Gives what went wrong, a line each; the other files are closed all the same.
         """
-        faults: list[str] = []
+        faults = self._faults
         for camera, video in zip(self.manifest.cameras, self.videos, strict=True):
             video.close()
             self.manifest.devices[camera].stream.written = video.pictures
@@ -143,15 +156,21 @@ class RecordingWriter:
                     files |= closer.close()
                 except OSError as error:
                     faults.append(f"{type(closer).__name__}: {error}")
-        self.events.close()
-        small = [CALIBRATION_NAME, EVENTS_NAME, *(video_name(index) for index in range(len(self.videos)))]
-        files |= {name: hash_file(self.folder / name) for name in small if (self.folder / name).exists()}
+        try:
+            self.events.close()
+            small = [CALIBRATION_NAME, EVENTS_NAME, *(video_name(index) for index in range(len(self.videos)))]
+            files |= {name: hash_file(self.folder / name) for name in small if (self.folder / name).exists()}
+        except OSError as error:
+            faults.append(f"{type(error).__name__}: {error}")
         self.manifest.files = dict(sorted(files.items()))
         self.manifest.duration_s = duration_ns / NS_PER_S
         self.manifest.stopped_by = stopped_by
         if not faults:
             self.manifest.state = "complete"
-        write_manifest(self.folder, self.manifest)
+        try:
+            write_manifest(self.folder, self.manifest)
+        except OSError as error:
+            faults.append(f"{MANIFEST_NAME}: {error}")
         return faults
 
 
