@@ -31,7 +31,7 @@ DIFOP_PERIOD_S = 1.1
 HELD_DATAGRAMS = 20_000
 COLLECT_S = 0.004
 BATCH_DATAGRAMS = 512
-FOREIGN_QUIET_NS = 10_000_000_000
+BURST_QUIET_NS = 10_000_000_000
 BYTES_PER_S = 18.1e6 + 8e6
 PACKET_SOCKET_BYTES = 2304
 """What the kernel charges for one datagram of 1210 bytes."""
@@ -209,7 +209,7 @@ class _LossWatch:
         self._link = link
         self._lost = self._restarts = self._kernel_drops = self._foreign = 0
         self._unexplained_drops = 0
-        self._last_foreign_ns = -FOREIGN_QUIET_NS
+        self._restart_burst, self._foreign_burst = _Burst(), _Burst()
 
     def forgive_kernel_drops(self) -> int:
         """Forget the drops so far; gives their number."""
@@ -229,20 +229,28 @@ class _LossWatch:
             self._unexplained_drops -= explained
             if lost > explained:
                 events.append(DeviceEvent("gap", f"{lost - explained} packets missing in frames", lost - explained))
-        if self._decoder.restarts > self._restarts:
-            self._restarts = self._decoder.restarts
-            events.append(DeviceEvent("warning", "the time in the packets jumped: frames start over"))
-        return (*events, *self._foreign_events(now_ns))
+        if restarts := self._decoder.restarts - self._restarts:
+            self._restarts += restarts
+            if self._restart_burst.begins(now_ns):
+                text = "the time in the packets jumped, frames start over: its clock was set, or two lidars send here"
+                events.append(DeviceEvent("warning", text, restarts))
+        if foreign := self._link.foreign - self._foreign:
+            self._foreign += foreign
+            if self._foreign_burst.begins(now_ns):
+                text = f"datagrams from other addresses than {self._link.address} are ignored"
+                events.append(DeviceEvent("warning", text, foreign))
+        return tuple(events)
 
-    def _foreign_events(self, now_ns: int) -> list[DeviceEvent]:
-        """One warning when datagrams of other senders begin to come; the next after they had ceased for a while."""
-        count = self._link.foreign - self._foreign
-        if not count:
-            return []
-        began = now_ns - self._last_foreign_ns >= FOREIGN_QUIET_NS
-        self._foreign, self._last_foreign_ns = self._link.foreign, now_ns
-        text = f"datagrams from other addresses than {self._link.address} are ignored"
-        return [DeviceEvent("warning", text, count)] if began else []
+
+class _Burst:
+    """Things that come in bursts and are told once for each."""
+
+    _last_ns = -BURST_QUIET_NS
+
+    def begins(self, now_ns: int) -> bool:
+        """Whether what happens now is the first of a burst: nothing of it had come for a while."""
+        quiet_ns, self._last_ns = now_ns - self._last_ns, now_ns
+        return quiet_ns >= BURST_QUIET_NS
 
 
 def _buffer_advice(link: UdpLink, first: Chunk) -> list[DeviceEvent]:

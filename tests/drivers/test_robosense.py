@@ -470,6 +470,21 @@ def test_kernel_drops_and_gaps_add_up(network: Network, monkeypatch: pytest.Monk
     assert dropped + lost + sum(scan.packets_received for scan in scans_of(items)) == 160
 
 
+def test_two_lidars_on_one_port_are_told_once(network: Network) -> None:
+    network.at_connect = lambda: network.send(*frame(0, 40))
+    driver = network.driver()
+    driver.connect()
+    stop = Event()
+    reading = driver.read(stop)
+    one, other = frame(1, 40), frame(1, 40, start_us=START_US + 7_777_777)
+    network.send(*[sent for at in range(0, 40, 2) for sent in one[at : at + 2] + other[at : at + 2]])
+    items = collect(reading, lambda items: chunk_count(items) == 120)
+    stop.set()
+    items += list(reading)
+    driver.close()
+    assert len([event for event in events_of(items, "warning") if "two lidars" in event.text]) == 1
+
+
 def test_nobody_there(network: Network) -> None:
     network.at_connect = lambda: network.send(*frame(0, 40)[:7], source=STRANGER)
     with pytest.raises(DeviceError, match=rf"no packet from {LIDAR} on UDP port {network.msop_port}.* 7 datagrams"):
