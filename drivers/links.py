@@ -4,13 +4,16 @@ Arrival is in nanoseconds of the host's monotonic clock. A serial line has no ke
 after the bytes; a datagram carries the kernel's stamp of its reception.
 """
 
+import contextlib
 import errno
+import math
 import os
 import select
 import socket
 import struct
+import termios
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import serial
@@ -23,11 +26,15 @@ DATAGRAM_BYTES = 65535
 DATAGRAMS_PER_READ = 512
 RECEIVE_BUFFER_BYTES = 32 << 20
 SILENCE_S = 3.0
+WRITE_TIMEOUT_S = 2.0
+WALL_CLOCK_STEP_NS = 1_000_000
+BURST_END_NS = 1_000_000_000
+BURST_MAX_NS = 10_000_000_000
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
-_TIMESPEC = struct.Struct("@qq")
+_TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
 
 
@@ -38,16 +45,23 @@ class SerialLink:
         """Open `port` raw, 8N1. Raises DeviceError when it is absent, taken or not allowed."""
         self.port = port
         try:
-            self._serial = serial.Serial(port, baud, timeout=0, write_timeout=2.0, exclusive=True)
-        except (OSError, ValueError) as error:
-            raise DeviceError(f"{port}: cannot open at {baud} baud: {_reason(error)}") from error
+            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True)
+        except (OSError, ValueError, OverflowError, termios.error) as error:
+            raise DeviceError(f"{port}: cannot open at {baud} baud: {_reason(error)}{_advice(error)}") from error
+        with contextlib.suppress(OSError, ValueError):  # an FTDI adapter holds bytes back for 16 ms otherwise
+            self._serial.set_low_latency_mode(True)
+        # poll, not select: a process with many files has descriptors that select does not take.
+        self._readable = select.poll()
+        self._readable.register(self._serial.fileno(), select.POLLIN)
+        self._writable = select.poll()
+        self._writable.register(self._serial.fileno(), select.POLLOUT)
 
     def read(self, timeout_s: float) -> tuple[int, bytes]:
         """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError on hang-up."""
         try:
             descriptor = self._serial.fileno()
-            readable, _, _ = select.select([descriptor], [], [], timeout_s)
-            if not readable:
+            events = self._readable.poll(_milliseconds(timeout_s))
+            if not events:
                 return time.monotonic_ns(), b""
             data = os.read(descriptor, READ_BYTES)
         except BlockingIOError:
@@ -55,14 +69,28 @@ class SerialLink:
         except OSError as error:
             raise DeviceError(f"{self.port}: device is gone: {_reason(error)}") from error
         arrival_ns = time.monotonic_ns()
-        if not data:
+        if not data and events[0][1] & (select.POLLHUP | select.POLLERR):
             raise DeviceError(f"{self.port}: device is gone (hang-up)")
         return arrival_ns, data
 
+    def discard_input(self) -> None:
+        """Throw away what waits unread. Raises DeviceError."""
+        try:
+            self._serial.reset_input_buffer()
+        except OSError as error:
+            raise DeviceError(f"{self.port}: device is gone: {_reason(error)}") from error
+
     def write(self, data: bytes) -> Chunk:
         """Send bytes; gives the chunk for the tape. Raises DeviceError."""
+        deadline_ns = time.monotonic_ns() + int(WRITE_TIMEOUT_S * 1e9)
+        left = memoryview(data)
         try:
-            self._serial.write(data)
+            descriptor = self._serial.fileno()
+            while left:
+                if not self._writable.poll(_milliseconds((deadline_ns - time.monotonic_ns()) / 1e9)):
+                    raise TimeoutError(errno.ETIMEDOUT, f"the device took nothing for {WRITE_TIMEOUT_S:g} s")
+                with contextlib.suppress(BlockingIOError):
+                    left = left[os.write(descriptor, left) :]
         except OSError as error:
             raise DeviceError(f"{self.port}: cannot write: {_reason(error)}") from error
         return Chunk(time.monotonic_ns(), data, sent=True)
@@ -86,17 +114,21 @@ class UdpLink:
         self.foreign = 0
         self.kernel_drops = 0
         self._drops_by_socket: dict[int, int] = {}
-        self._sockets: list[socket.socket] = []
+        self._sockets: dict[int, socket.socket] = {}
+        self._readable = select.poll()
+        self._realtime_minus_monotonic_ns = _realtime_minus_monotonic_ns()
         try:
-            packed = socket.inet_aton(address)
+            packed = socket.inet_pton(socket.AF_INET, address)
         except OSError as error:
             raise DeviceError(f"address {address!r}: not an IPv4 address") from error
         bind_address = "127.0.0.1" if packed[0] == 127 else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
-            self._sockets.append(self._bind(bind_address, port))
+            udp = self._bind(bind_address, port)
+            self._sockets[udp.fileno()] = udp
+            self._readable.register(udp, select.POLLIN)
         self.receive_buffer_bytes = min(
-            bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for bound in self._sockets
+            bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for bound in self._sockets.values()
         )
 
     def _bind(self, bind_address: str, port: int) -> socket.socket:
@@ -110,26 +142,29 @@ class UdpLink:
         udp.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         try:
             udp.bind((bind_address, port))
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             udp.close()
             self.close()
-            raise DeviceError(f"UDP port {port} on {bind_address}: {_reason(error)}") from error
+            raise DeviceError(f"UDP port {port} on {bind_address}: {_reason(error)}{_advice(error)}") from error
         return udp
 
     def read(self, timeout_s: float) -> list[Chunk]:
         """What has come on all ports, in order of arrival; empty after `timeout_s`."""
-        readable, _, _ = select.select(self._sockets, [], [], timeout_s)
-        if not readable:
+        events = self._readable.poll(_milliseconds(timeout_s))
+        if not events:
             return []
-        realtime_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
+        offset_ns = _realtime_minus_monotonic_ns()
+        wall_clock_was_set = abs(offset_ns - self._realtime_minus_monotonic_ns) > WALL_CLOCK_STEP_NS
+        self._realtime_minus_monotonic_ns = offset_ns
         chunks: list[Chunk] = []
-        for udp in readable:
-            self._drain(udp, realtime_minus_monotonic_ns, chunks)
-        if len(readable) > 1:
+        for descriptor, _ in events:
+            # What waits may have been stamped before the wall clock was set: then the time of reading is the truth.
+            self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns, chunks)
+        if len(events) > 1:
             chunks.sort(key=lambda chunk: chunk.arrival_ns)
         return chunks
 
-    def _drain(self, udp: socket.socket, realtime_minus_monotonic_ns: int, chunks: list[Chunk]) -> None:
+    def _drain(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
         destination = udp.getsockname()
         for _ in range(DATAGRAMS_PER_READ):
             try:
@@ -137,16 +172,15 @@ class UdpLink:
             except BlockingIOError:
                 return
             except OSError as error:
-                if error.errno in (errno.ECONNREFUSED, errno.EINTR):
+                if error.errno == errno.ECONNREFUSED:  # a late answer to something sent, not about what comes
                     continue
                 raise DeviceError(f"UDP port {destination[1]}: {_reason(error)}") from error
-            now_ns = time.monotonic_ns()
-            arrival_ns = now_ns
+            arrival_ns = now_ns = time.monotonic_ns()
             for _, kind, payload in ancillary:
-                if kind == SO_TIMESTAMPNS:
+                if kind == SO_TIMESTAMPNS and offset_ns is not None:
                     seconds, nanoseconds = _TIMESPEC.unpack_from(payload)
-                    stamp_ns = seconds * 1_000_000_000 + nanoseconds - realtime_minus_monotonic_ns
-                    # A step of the wall clock between stamp and read would show as the future or the far past.
+                    stamp_ns = seconds * 1_000_000_000 + nanoseconds - offset_ns
+                    # A wall clock that was set in this very moment would show as the future or the far past.
                     if now_ns - 10_000_000_000 < stamp_ns <= now_ns:
                         arrival_ns = stamp_ns
                 elif kind == SO_RXQ_OVFL:
@@ -162,8 +196,10 @@ class UdpLink:
 
     def close(self) -> None:
         """Close all sockets."""
-        for udp in self._sockets:
+        for descriptor, udp in self._sockets.items():
+            self._readable.unregister(descriptor)
             udp.close()
+        self._sockets.clear()
 
 
 class CountsBadInput(Protocol):
@@ -175,23 +211,57 @@ class CountsBadInput(Protocol):
 
 @dataclass(slots=True)
 class GarbageWatch:
-    """Turns a decoder's counters of bad input into one event per burst (ended by a second without any)."""
+    """Turns a decoder's counters of bad input into one event per burst (ended by a second without any).
+
+    A burst that does not end is told every ten seconds.
+    """
 
     decoder: CountsBadInput
     _reported: tuple[int, int] = (0, 0)
     _seen: tuple[int, int] = (0, 0)
-    _last_growth_ns: int = field(default=0)
+    _begin_ns: int = 0
+    _last_growth_ns: int = 0
 
     def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
         """The event of a burst that is over, else nothing."""
         counters = (self.decoder.bad_frames, self.decoder.skipped_bytes)
         if counters != self._seen:
+            if self._seen == self._reported:
+                self._begin_ns = now_ns
             self._seen, self._last_growth_ns = counters, now_ns
-        if self._seen == self._reported or now_ns - self._last_growth_ns < 1_000_000_000:
+        is_over = now_ns - self._last_growth_ns >= BURST_END_NS or now_ns - self._begin_ns >= BURST_MAX_NS
+        if self._seen == self._reported or not is_over:
             return ()
         frames, skipped = (new - old for new, old in zip(self._seen, self._reported, strict=True))
         self._reported = self._seen
         return (DeviceEvent("garbage", f"{frames} bad frames, {skipped} bytes skipped", frames or skipped),)
+
+
+def _realtime_minus_monotonic_ns() -> int:
+    """Distance of the two clocks, as of a moment in which nothing came between the readings."""
+    best_ns, best_width_ns = 0, 1 << 62
+    for _ in range(5):
+        before_ns = time.monotonic_ns()
+        realtime_ns = time.time_ns()
+        width_ns = time.monotonic_ns() - before_ns
+        if width_ns < best_width_ns:
+            best_ns, best_width_ns = realtime_ns - before_ns - width_ns // 2, width_ns
+        if width_ns < 5_000:
+            break
+    return best_ns
+
+
+def _milliseconds(seconds: float) -> int:
+    return max(0, math.ceil(seconds * 1000))
+
+
+def _advice(error: Exception) -> str:
+    match getattr(error, "errno", None):
+        case errno.EAGAIN | errno.EBUSY | errno.EADDRINUSE:
+            return "; another program uses it"
+        case errno.EACCES | errno.EPERM:
+            return "; the user may not use it (serial ports: group dialout)"
+    return ""
 
 
 def _reason(error: Exception) -> str:

@@ -58,6 +58,7 @@ class NmeaDriver:
             raise DeviceError(f"{self._config.port}: not connected")
         period_s = 1 / self._config.rate_hz
         idle_s = max(MIN_IDLE_S, IDLE_SHARE * period_s)
+        self._link.discard_input()  # the arrival of what waits is not known
         decoder = NmeaDecoder(time.time_ns())
         arrivals = _Arrivals()
         where = f"{self._config.port} at {self._config.baud} baud"

@@ -84,7 +84,7 @@ class XsensConfig(DeviceConfig, frozen=True, kw_only=True):
 
     port: str
     baud: Annotated[int, Meta(gt=0)] = 115200
-    rate_hz: Annotated[int, Meta(ge=1, le=2000)] = 400
+    rate_hz: Annotated[int, Meta(ge=1, le=2000)] = 100
     configure: bool = True
     magnetic_field_ut: Annotated[float, Meta(gt=0)] = 50.0
 
@@ -133,6 +133,7 @@ class XsensDriver:
                 raise
 
     def _configure(self, link: SerialLink) -> None:
+        """All but GoToMeasurement: the device stays quiet until it is read, so that nothing waits in the port."""
         dialogue = _Dialogue(link, self._decoder.framer, f"{self._config.port} at {self._config.baud} baud")
         outputs = output_configuration(self._config.rate_hz)
         dialogue.ask(GO_TO_CONFIG)
@@ -140,19 +141,27 @@ class XsensDriver:
         firmware = dialogue.ask(REQUEST_FIRMWARE)
         answer = dialogue.ask(SET_OUTPUT_CONFIGURATION, b"".join(struct.pack(">HH", *both) for both in outputs.items()))
         self._rate_hz, warnings = _accepted(outputs, answer, dialogue.where)
-        dialogue.ask(GO_TO_MEASUREMENT)
         self._identity = {"serial": device_id.hex().upper(), "firmware": ".".join(map(str, firmware[:3]))}
+        self._begun = Received(tuple(dialogue.chunks), events=warnings)
+
+    def _begin(self, link: SerialLink) -> Received:
+        """Let the device measure, or where it does so already throw away what waits: its arrival is not known."""
+        if not self._config.configure:
+            link.discard_input()
+            return Received()
+        dialogue = _Dialogue(link, self._decoder.framer, f"{self._config.port} at {self._config.baud} baud")
+        dialogue.ask(GO_TO_MEASUREMENT)
         framer = self._decoder.framer  # what was skipped up to here was the measurement that we broke off
         framer.bad_frames = framer.skipped_bytes = 0
         samples = self._decoder.samples(dialogue.left_over)
-        self._begun = Received(tuple(dialogue.chunks), _stamped(dialogue.arrival_ns, samples), warnings)
+        return Received(tuple(dialogue.chunks), _stamped(dialogue.arrival_ns, samples))
 
     def read(self, stop: Event) -> Iterator[Received]:
         """Yield the handshake, then what comes. Raises DeviceError when the device is gone or silent."""
         if self._link is None:
             raise DeviceError(f"{self._config.port}: not connected")
-        begun, self._begun = self._begun, Received()
-        yield begun
+        yield self._begun
+        yield self._begin(self._link)
         care = _Care(self._decoder, f"{self._config.port} at {self._config.baud} baud")
         while not stop.is_set():
             arrival_ns, data = self._link.read(READ_S)

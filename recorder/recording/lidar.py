@@ -36,7 +36,6 @@ class ScanWriter:
         self._entries: dict[str, FileEntry] = {}
         self._on_error = on_error
         self._queue: ByteQueue[tuple[str, npt.NDArray[np.void], Ticket]] = ByteQueue(QUEUE_BYTES)
-        self._in_hand: list[tuple[str, npt.NDArray[np.void], Ticket]] = []
         self._batch: list[tuple[str, npt.NDArray[np.void], Ticket]] = []
         self._thread = start_thread("lidar", self._run, self._failed)
 
@@ -72,12 +71,10 @@ class ScanWriter:
         """After an error no scan can be written: fail all tickets, so that no line waits for them."""
         self._on_error(name, error)
         for _, _, ticket in self._batch:
-            if ticket.state == "pending":
-                ticket.state = "failed"
-        while self._in_hand or not self._queue.ended:
-            for _, _, ticket in self._in_hand:
+            ticket.fail()
+        while not self._queue.ended:
+            for _, _, ticket in self._queue.get_all(0.5):
                 ticket.fail()
-            self._in_hand = self._queue.get_all(0.5)
 
     def close(self) -> dict[str, FileEntry]:
         """Write what is left; gives size and hash of each file."""

@@ -52,7 +52,6 @@ class VideoWriter:
         self._format: VideoFormat | None = None
         self._last_ms = -1
         self._queue: ByteQueue[tuple[int, FrameSample, Ticket]] = ByteQueue(QUEUE_BYTES)
-        self._in_hand: list[tuple[int, FrameSample, Ticket]] = []
         self._batch: list[tuple[int, FrameSample, Ticket]] = []
         self._in_muxer: Ticket | None = None
         self._on_error = on_error
@@ -111,8 +110,6 @@ class VideoWriter:
         )
         assert isinstance(stream, VideoStream)
         stream.time_base = MILLISECONDS
-        if video.extradata:
-            stream.codec_context.extradata = video.extradata
         self._format = video
         return container, stream
 
@@ -148,8 +145,7 @@ class VideoWriter:
         if self._in_muxer is not None:
             self._in_muxer.state = "failed"
         for _, _, ticket in self._batch:
-            if ticket.state == "pending":
-                ticket.state = "failed"
+            ticket.fail()
         while not self._queue.ended:
             for _, _, ticket in self._queue.get_all(IDLE_S):
                 ticket.state = "failed"
