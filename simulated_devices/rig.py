@@ -26,7 +26,7 @@ import msgspec
 import yaml
 
 from recorder.errors import ConfigError
-from recorder.rig import apply_settings
+from recorder.rig import DEVICE_NAME, apply_settings
 from simulated_devices.camera import CameraSettings, CameraSimulator
 from simulated_devices.nmea import NmeaSettings, NmeaSimulator
 from simulated_devices.pose import PoseSettings, PoseSimulator
@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 BUILT_IN = "built-in rig"
 OPENING_NS = 5 * SECOND_NS
 _EXIT_S = 0.5
+_ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 Settings = TypeVar("Settings", bound=msgspec.Struct)
 
@@ -92,7 +93,7 @@ def read_rig(path: Path | None, settings: tuple[str, ...] = ()) -> dict[str, Any
     """The rig file, or the built-in rig, with `key.path=value` settings applied. Raises ConfigError."""
     origin = str(path) if path else BUILT_IN
     try:
-        text = path.read_text() if path else files("simulated_devices").joinpath("rig.yaml").read_text()
+        text = (path or files("simulated_devices").joinpath("rig.yaml")).read_text(encoding="utf-8")
         source = yaml.safe_load(text)
     except OSError as error:
         raise ConfigError(f"{origin}: cannot read: {error.strerror}") from error
@@ -204,6 +205,8 @@ class Cast:
 
     def device(self, name: str, entry: object) -> SimulatedDevice:
         """The simulated device of one entry under `devices`. Raises ConfigError."""
+        if not DEVICE_NAME.fullmatch(name):
+            raise ConfigError(f"devices.{name}: a device name is a letter, then letters, digits, _ or -")
         if not isinstance(entry, dict):
             raise ConfigError(f"devices.{name}: must be a mapping with the key driver")
         driver = entry.get("driver")
@@ -321,18 +324,21 @@ class Simulation:
 
     def _start(self) -> None:
         context = get_context("fork")  # the children share the textures built here
-        for device in self._devices:
-            process = context.Process(
-                target=_device_process, args=(device, os.getpid(), self._report), name=device.name, daemon=True
-            )
-            process.start()
-            self._processes[device.name] = process
+        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)  # until each child has handlers of its own
+        try:
+            for device in self._devices:
+                process = context.Process(
+                    target=_device_process, args=(device, os.getpid(), self._report), name=device.name, daemon=True
+                )
+                process.start()
+                self._processes[device.name] = process
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
         for device in self._devices:
             device.close()
 
     def _end(self) -> None:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)  # nothing shall break off the cleaning up
         for process in self._processes.values():
             process.terminate()
         deadline_s = time.monotonic() + _EXIT_S
@@ -343,6 +349,7 @@ class Simulation:
                 process.join()
         self._ports.close()
         shutil.rmtree(self._folder, ignore_errors=True)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
 
 
 def _device_process(device: SimulatedDevice, parent: int, report: bool) -> None:
@@ -357,6 +364,7 @@ def _device_process(device: SimulatedDevice, parent: int, report: bool) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this one
     signal.signal(signal.SIGTERM, end)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
     die_with_parent()
     wake_precisely()
     if os.getppid() == parent:
