@@ -17,6 +17,7 @@ from drivers.samples import DeviceEvent, Received
 
 ENTRY_POINT_GROUP = "rigtape.drivers"
 RETRY_S = 0.5
+MAX_CAUSES = 8
 
 
 class DeviceError(Exception):
@@ -104,22 +105,47 @@ def driver_type(name: str) -> DriverType:
 
 
 def received(driver: Driver, stop: Event, *, connected: bool) -> Iterator[Received]:
-    """Yield what a device sends until `stop` is set, taking it up again whenever it was lost."""
-    last_error = ""
-    while not stop.is_set():
-        try:
-            if not connected:
-                driver.connect()
-            connected, last_error = True, ""
-            yield Received(events=(DeviceEvent("connected", _identity_text(driver)),))
-            yield from driver.read(stop)
-        except DeviceError as error:
-            driver.close()
-            if str(error) != last_error:  # one event for a device that stays away, not one for each attempt
-                yield Received(events=(DeviceEvent("lost" if connected else "warning", str(error)),))
-            connected, last_error = False, str(error)
-            stop.wait(RETRY_S)
-    driver.close()
+    """Yield what a device sends until `stop` is set, taking it up again whenever it was lost.
+
+    It is told as connected with its first data: a port that can be opened but stays silent is no news.
+    """
+    is_present = connected
+    told: set[str] = set()  # of one absence: an event for each cause, not for each attempt
+    try:
+        while not stop.is_set():
+            try:
+                if not connected:
+                    driver.connect()
+                connected = False
+                for item in _announced(driver, stop):
+                    if item.chunks or item.samples:
+                        is_present = True
+                        told.clear()
+                    yield item
+            except DeviceError as error:
+                driver.close()
+                text = str(error)
+                if is_present or (text not in told and len(told) < MAX_CAUSES):
+                    told.add(text)
+                    yield Received(events=(DeviceEvent("lost" if is_present else "warning", text),))
+                is_present = False
+                stop.wait(RETRY_S)
+    finally:
+        driver.close()
+
+
+def _announced(driver: Driver, stop: Event) -> Iterator[Received]:
+    """What the driver reads, its first data with the event that it is connected."""
+    is_announced = False
+    for item in driver.read(stop):
+        if not is_announced and (item.chunks or item.samples):
+            is_announced = True
+            event = DeviceEvent("connected", _identity_text(driver))
+            yield Received(item.chunks, item.samples, (event, *item.events))
+        else:
+            yield item
+    if not stop.is_set():
+        raise DeviceError("the driver ended without saying why")
 
 
 def _identity_text(driver: Driver) -> str:

@@ -77,7 +77,7 @@ class SerialLink:
         """Throw away what waits unread. Raises DeviceError."""
         try:
             self._serial.reset_input_buffer()
-        except OSError as error:
+        except (OSError, termios.error) as error:
             raise DeviceError(f"{self.port}: device is gone: {_reason(error)}") from error
 
     def write(self, data: bytes) -> Chunk:
@@ -88,7 +88,7 @@ class SerialLink:
             descriptor = self._serial.fileno()
             while left:
                 if not self._writable.poll(_milliseconds((deadline_ns - time.monotonic_ns()) / 1e9)):
-                    raise TimeoutError(errno.ETIMEDOUT, f"the device took nothing for {WRITE_TIMEOUT_S:g} s")
+                    raise DeviceError(f"{self.port}: cannot write: nothing was taken for {WRITE_TIMEOUT_S:g} s")
                 with contextlib.suppress(BlockingIOError):
                     left = left[os.write(descriptor, left) :]
         except OSError as error:

@@ -5,26 +5,40 @@ the next key frame; each of them still gives a LostFrame, because its time is kn
 """
 
 import errno
+import re
 import time
+from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from fractions import Fraction
 from threading import Event
+from typing import Annotated
 
 import av
 import msgspec
 from av.container import InputContainer
 from av.packet import Packet
 from av.video.stream import VideoStream
+from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
-from drivers.links import SILENCE_S
+from drivers.links import SILENCE_S, GarbageWatch
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, Sample, VideoFormat
 
-INTER_CODED = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "mpeg4"})
-INTRA_CODED = frozenset({"mjpeg", "ffv1", "rawvideo", "png"})
+INTER_CODED = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "mpeg4", "ffv1"})
+INTRA_CODED = frozenset({"mjpeg", "rawvideo", "png"})
 OPEN_TIMEOUT_S = 5.0
-LIVE_OPTIONS = {"fflags": "nobuffer", "probesize": "32768", "analyzeduration": "0"}
+# FFmpeg looks at the first picture only, and hands it on: `fflags nobuffer` would keep what was looked at, which is
+# the first key frame, and all pictures up to the second one would be worthless.
+LIVE_OPTIONS = {"probesize": "32", "analyzeduration": "0"}
+# For a stream joined between key frames: read on until the size is known, but not to guess the frame rate.
+PATIENT_OPTIONS = {"fpsprobesize": "0"}
+AVFMT_NOTIMESTAMPS = 0x0080  # libavformat/avformat.h
 NS_PER_S = 1_000_000_000
+USUAL_FPS = 30.0
+SILENT_PERIODS = 3
+REMEMBERED_INTERVALS = 9
+ENOUGH_INTERVALS = 5
 BYTES_PER_PIXEL = 0.25  # generous for H.264 at visually lossless quality; only the disk check uses it
 
 
@@ -36,16 +50,20 @@ class StreamConfig(DeviceConfig, frozen=True, kw_only=True):
     """
 
     url: str
-    fps: float = 30.0
-    exposure_s: float | None = None
-    width: int | None = None
-    height: int | None = None
+    fps: Annotated[float, Meta(gt=0)] = USUAL_FPS
+    exposure_s: Annotated[float, Meta(ge=0)] | None = None
+    width: Annotated[int, Meta(gt=0)] | None = None
+    height: Annotated[int, Meta(gt=0)] | None = None
     format: str = ""
     options: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class StreamDriver:
-    """One camera behind an FFmpeg URL. Device time is the stream's presentation time in nanoseconds."""
+    """One camera behind an FFmpeg URL. Device time is the stream's presentation time in nanoseconds.
+
+    A stream that carries no time at all (raw H.264, MJPEG over HTTP) is stamped with the arrival of each picture.
+    bad_frames: pictures left out because they are damaged or lack a time stamp; skipped_bytes: what they held.
+    """
 
     tick_hz = 1e9
     wrap_bits = 0
@@ -53,50 +71,72 @@ class StreamDriver:
     def __init__(self, name: str, config: StreamConfig) -> None:
         """Nothing is opened yet."""
         self._config = config
+        self._shown_url = re.sub(r"//[^/@]*@", "//", config.url)  # a password does not belong into a recording
         pixels = (config.width or 1280) * (config.height or 800)
         self.streams = (StreamSpec("frames", config.fps, pixels * BYTES_PER_PIXEL * config.fps),)
+        self.bad_frames = self.skipped_bytes = 0
+        self._garbage = GarbageWatch(self)
         self._container: InputContainer | None = None
         self._wait_for_keyframe = True
-        self._last_ticks: int | None = None
+        self._rhythm = _Rhythm(config.fps)
+        self._last_dts: int | None = None
 
     @property
     def identity(self) -> dict[str, str]:
         """The URL is all that such a camera tells."""
-        return {"url": self._config.url} if self._container else {}
+        return {"url": self._shown_url} if self._container else {}
 
     def connect(self) -> None:
         """Open the URL. Raises DeviceError when nothing answers or the video cannot be recorded."""
-        url = self._config.url
+        self._wait_for_keyframe, self._last_dts = True, None
         try:
-            self._container = av.open(
-                url,
-                mode="r",
-                format=self._config.format or None,
-                options=LIVE_OPTIONS | self._config.options,
-                timeout=(OPEN_TIMEOUT_S, SILENCE_S),
-            )
-        except (av.error.FFmpegError, OSError, ValueError) as error:
-            raise DeviceError(f"{url}: cannot open: {_reason(error)}") from error
-        self._wait_for_keyframe, self._last_ticks = True, None
-        try:
+            self._container = self._open(LIVE_OPTIONS)
+            if not self._size_is_known():
+                self._container = self._open(PATIENT_OPTIONS)
             self._format = self._check_video()
         except DeviceError:
             self.close()
             raise
 
+    def _open(self, options: dict[str, str]) -> InputContainer:
+        self.close()
+        try:
+            return av.open(
+                self._config.url,
+                mode="r",
+                format=self._config.format or None,
+                options=options | self._config.options,
+                timeout=(OPEN_TIMEOUT_S, self._silence_s),
+            )
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            reason = _reason(error, f"no answer or no picture for {OPEN_TIMEOUT_S:g} s")
+            raise DeviceError(f"{self._shown_url}: cannot open: {reason}") from error
+
+    @property
+    def _silence_s(self) -> float:
+        return max(SILENCE_S, SILENT_PERIODS / self._config.fps)
+
+    def _size_is_known(self) -> bool:
+        assert self._container is not None
+        video = self._container.streams.video
+        return bool(video) and video[0].codec_context.width > 0
+
     def _check_video(self) -> VideoFormat:
-        url = self._config.url
         stream = self._video_stream()
         context = stream.codec_context
         if context.name not in INTER_CODED | INTRA_CODED:
             allowed = ", ".join(sorted(INTER_CODED | INTRA_CODED))
-            raise DeviceError(f"{url}: video is {context.name}; it can be recorded as {allowed}")
+            raise DeviceError(f"{self._shown_url}: video is {context.name}; it can be recorded as {allowed}")
+        if not self._size_is_known():
+            raise DeviceError(f"{self._shown_url}: no key frame came that tells the size of the pictures")
         for side, want, got in (
             ("width", self._config.width, context.width),
             ("height", self._config.height, context.height),
         ):
             if want is not None and want != got:
-                raise DeviceError(f"{url}: {side} is {got}, configured {want}")
+                raise DeviceError(f"{self._shown_url}: {side} is {got}, configured {want}")
+        if context.has_b_frames:
+            raise self._b_frames()
         return VideoFormat(
             context.name,
             context.width,
@@ -106,9 +146,17 @@ class StreamDriver:
             bytes(context.extradata or b""),
         )
 
+    def _b_frames(self) -> DeviceError:
+        return DeviceError(
+            f"{self._shown_url}: the video has B-frames (pictures are sent in another order than taken); "
+            "switch B-frames off in the camera, for H.264 by its baseline profile"
+        )
+
     def _video_stream(self) -> VideoStream:
-        if self._container is None or not self._container.streams.video:
-            raise DeviceError(f"{self._config.url}: no video in it")
+        if self._container is None:
+            raise DeviceError(f"{self._shown_url}: not connected")
+        if not self._container.streams.video:
+            raise DeviceError(f"{self._shown_url}: no video in it")
         return self._container.streams.video[0]
 
     def read(self, stop: Event) -> Iterator[Received]:
@@ -116,44 +164,62 @@ class StreamDriver:
         stream = self._video_stream()
         assert self._container is not None
         time_base = stream.time_base or Fraction(1, NS_PER_S)
+        has_time = not self._container.format.flags & AVFMT_NOTIMESTAMPS
+        if not has_time:
+            text = f"{self._shown_url}: the stream carries no time stamps; pictures are stamped when they arrive"
+            yield Received(events=(DeviceEvent("warning", text),))
         packets = self._container.demux(stream)
         while not stop.is_set():
-            try:
-                packet = next(packets)
-            except StopIteration:
-                raise DeviceError(f"{self._config.url}: the stream has ended") from None
-            except (av.error.FFmpegError, OSError) as error:
-                raise DeviceError(f"{self._config.url}: {_reason(error)}") from error
+            packet = self._next(packets)
             arrival_ns = time.monotonic_ns()
             if packet.size == 0:  # PyAV marks the end of a stream by an empty packet
                 continue
-            if packet.pts is None:
-                yield Received(events=(DeviceEvent("garbage", "a picture without time stamp is left out", 1),))
-                self._wait_for_keyframe = True
-                continue
-            device_ticks = int(packet.pts * time_base * NS_PER_S)
-            yield self._picture(packet, device_ticks, arrival_ns)
+            if not has_time:
+                yield self._picture(packet, arrival_ns, arrival_ns, lost=0)
+            elif packet.pts is None:
+                self._leave_out(packet)
+                yield Received(events=self._garbage.events(arrival_ns))
+            else:
+                yield self._stamped(packet, int(packet.pts * time_base * NS_PER_S), arrival_ns)
 
-    def _picture(self, packet: "Packet[VideoStream]", device_ticks: int, arrival_ns: int) -> Received:
-        lost = self._pictures_lost_before(device_ticks)
-        events = (DeviceEvent("gap", f"{lost} pictures lost before this one", lost),) if lost else ()
-        inter_coded = self._format.codec in INTER_CODED
-        if (lost or packet.is_corrupt) and inter_coded:
-            self._wait_for_keyframe = True
-        sample: Sample
-        if packet.is_keyframe or not inter_coded:
+    def _next(self, packets: "Iterator[Packet[VideoStream]]") -> "Packet[VideoStream]":
+        try:
+            return next(packets)
+        except StopIteration:
+            raise DeviceError(f"{self._shown_url}: the stream has ended") from None
+        except (av.error.FFmpegError, OSError) as error:
+            reason = _reason(error, f"no picture for {self._silence_s:g} s")
+            raise DeviceError(f"{self._shown_url}: {reason}") from error
+
+    def _leave_out(self, packet: "Packet[VideoStream]") -> None:
+        self.bad_frames += 1
+        self.skipped_bytes += packet.size
+        self._wait_for_keyframe = True
+
+    def _stamped(self, packet: "Packet[VideoStream]", device_ticks: int, arrival_ns: int) -> Received:
+        previous_dts, self._last_dts = self._last_dts, packet.dts
+        dts_goes_on = packet.dts is not None and previous_dts is not None and packet.dts > previous_dts
+        # A camera that sets its clock back moves both times back; B-frames only the time of presentation.
+        if dts_goes_on and self._rhythm.is_before_last(device_ticks):
+            raise self._b_frames()
+        return self._picture(packet, device_ticks, arrival_ns, self._rhythm.lost_before(device_ticks, arrival_ns))
+
+    def _picture(self, packet: "Packet[VideoStream]", device_ticks: int, arrival_ns: int, lost: int) -> Received:
+        events = self._garbage.events(arrival_ns) + self._rhythm.events()
+        if lost:
+            events += (DeviceEvent("gap", f"{lost} pictures lost before this one", lost),)
+        if packet.is_keyframe or self._format.codec in INTRA_CODED:
             self._wait_for_keyframe = False
+        elif lost:
+            self._wait_for_keyframe = True
+        if packet.is_corrupt:
+            self._leave_out(packet)
+        sample: Sample
         if self._wait_for_keyframe:
             sample = LostFrame(device_ticks)
         else:
             sample = FrameSample(device_ticks, bytes(packet), packet.is_keyframe, self._format, self._config.exposure_s)
         return Received(samples=((arrival_ns, sample),), events=events)
-
-    def _pictures_lost_before(self, device_ticks: int) -> int:
-        last_ticks, self._last_ticks = self._last_ticks, device_ticks
-        if last_ticks is None:
-            return 0
-        return max(0, round((device_ticks - last_ticks) * self._config.fps / NS_PER_S) - 1)
 
     def close(self) -> None:
         """Close the stream."""
@@ -162,10 +228,56 @@ class StreamDriver:
             self._container = None
 
 
-def _reason(error: Exception) -> str:
+@dataclass(slots=True)
+class _Rhythm:
+    """Tells from the time between pictures how many are missing, also across a new connection.
+
+    fps: what is configured; it counts until enough pictures have come to tell the true rate, for a wrong `fps` must
+    not make every picture look like the one after a gap.
+    """
+
+    fps: float
+    _told_ns: float = 0.0
+    _last: tuple[int, int] | None = None
+    _intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_INTERVALS))
+
+    def is_before_last(self, device_ticks: int) -> bool:
+        """Whether the stream's time goes back."""
+        return self._last is not None and device_ticks < self._last[0]
+
+    def lost_before(self, device_ticks: int, arrival_ns: int) -> int:
+        """How many pictures are missing before this one; none when the camera's clock was set anew."""
+        last, self._last = self._last, (device_ticks, arrival_ns)
+        if last is None:
+            return 0
+        interval_ns, waited_ns = device_ticks - last[0], arrival_ns - last[1]
+        # A stalled stream is given up after SILENCE_S, so more time than that cannot come at once.
+        if not 0 < interval_ns < waited_ns + SILENCE_S * NS_PER_S:
+            return 0
+        lost = max(0, round(interval_ns / self._period_ns()) - 1)
+        self._intervals_ns.append(interval_ns)
+        return lost
+
+    def _period_ns(self) -> float:
+        """The time between two pictures. A third of the intervals suffices: those across a gap are longer."""
+        if len(self._intervals_ns) < ENOUGH_INTERVALS:
+            return NS_PER_S / self.fps
+        return sorted(self._intervals_ns)[len(self._intervals_ns) // 3]
+
+    def events(self) -> tuple[DeviceEvent, ...]:
+        """A warning when the rate is found to be another than configured, or than last told."""
+        period_ns, told_ns = self._period_ns(), self._told_ns or NS_PER_S / self.fps
+        if 0.8 < period_ns / told_ns < 1.25:
+            return ()
+        self._told_ns = period_ns
+        rate_hz = NS_PER_S / period_ns
+        return (DeviceEvent("warning", f"pictures come at {rate_hz:.1f} Hz, configured is fps: {self.fps:g}"),)
+
+
+def _reason(error: Exception, timed_out: str) -> str:
     number = getattr(error, "errno", None)
     if isinstance(error, av.error.ExitError):
-        return f"no answer or no picture for {SILENCE_S:.0f} s"
+        return timed_out
     if isinstance(number, int) and number in errno.errorcode:
         return f"{getattr(error, 'strerror', error)} ({errno.errorcode[number]})"
     return str(error)
