@@ -6,6 +6,7 @@ A rig is a YAML mapping: `name`, `devices` (one entry per device, `driver` choos
 """
 
 import copy
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -69,9 +70,11 @@ def parse_rig(text: str, origin: str, folder: Path, settings: tuple[str, ...] = 
     raw = source.get("raw", True)
     if not isinstance(raw, bool):
         raise ConfigError(f"{origin}: raw: must be true or false")
+    made = tuple(_device(name, entry, origin) for name, entry in devices.items())
+    _check_values(source, "", origin)
     return Rig(
         name=str(source.get("name", "rig")),
-        devices=tuple(_device(name, entry, origin) for name, entry in devices.items()),
+        devices=made,
         calibration=(folder / calibration) if calibration else None,
         raw=raw,
         source=source,
@@ -136,6 +139,20 @@ def _device(name: object, entry: object, origin: str) -> RigDevice:
         key_path = where + place.rstrip("`")
         raise ConfigError(f"{origin}: {key_path}: {message}") from error
     return RigDevice(name, driver, config)
+
+
+def _check_values(node: object, where: str, origin: str) -> None:
+    """What JSON cannot hold can neither be meant nor go into recording.json."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            if not isinstance(key, str):
+                raise ConfigError(f"{origin}: {where}{key}: a key must be text; quote it")
+            _check_values(value, f"{where}{key}.", origin)
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            _check_values(value, f"{where}{index}.", origin)
+    elif isinstance(node, float) and not math.isfinite(node):
+        raise ConfigError(f"{origin}: {where.rstrip('.')}: must be a finite number, is {node}")
 
 
 def _allow_keys(entry: Mapping[Any, Any], allowed: tuple[str, ...], where: str, origin: str) -> None:
