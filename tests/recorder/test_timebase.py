@@ -1,0 +1,232 @@
+"""The timebase on made-up arrivals: what is held and when it is let go, shared clocks, latency, epochs, scans."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.samples import POINT_DTYPE, ClockPairs, FixSample, ImuSample, ScanSample
+from recorder.timebase import HOLD_AT_START_NS, HOLD_NS, Stamped, Timebase
+
+S = 1_000_000_000
+MS = 1_000_000
+START_NS = 250_000 * S
+PERIOD_NS = 5 * MS
+FLOOR_NS = 1 * MS
+
+
+def imu(ticks: int | None, sequence: int = 0) -> ImuSample:
+    return ImuSample(sequence, ticks, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
+
+
+def truth_ns(index: int) -> int:
+    """Host time at which sample `index` was taken."""
+    return START_NS + index * PERIOD_NS
+
+
+def one_device(**changes) -> Timebase:
+    timebase = Timebase(START_NS)
+    keys = {"clock": "imu", "tick_hz": 1e6, "wrap_bits": 32, "latency_ns": 0} | changes
+    timebase.add_device("imu", **keys)
+    return timebase
+
+
+def feed(timebase: Timebase, first: int, last: int, *, ticks_at_0: int = 0, delay_ns=lambda index: FLOOR_NS):
+    """Samples first..last-1 of the device; gives what came back."""
+    stamped: list[Stamped] = []
+    for index in range(first, last):
+        ticks = (ticks_at_0 + index * PERIOD_NS // 1000) % (1 << 32)
+        stamped += timebase.take("imu", truth_ns(index) + delay_ns(index), imu(ticks, index))
+    return stamped
+
+
+def errors_ns(stamped: list[Stamped]) -> list[int]:
+    return [entry.host_ns - truth_ns(entry.sample.sequence) - FLOOR_NS for entry in stamped]
+
+
+def test_the_first_samples_are_held_until_the_clock_is_known_and_stamped_by_what_was_learnt():
+    timebase = one_device()
+    late_at_first = lambda index: FLOOR_NS + (40 * MS if index < 20 else 0)  # noqa: E731
+    held = HOLD_AT_START_NS // PERIOD_NS
+    assert feed(timebase, 0, held - 1, delay_ns=late_at_first) == []
+    stamped = feed(timebase, held - 1, held + 3, delay_ns=late_at_first)
+    assert [entry.sample.sequence for entry in stamped] == list(range(held + 3))
+    assert max(map(abs, errors_ns(stamped))) < 0.5 * MS
+
+
+def test_held_samples_are_let_go_by_time_too():
+    timebase = one_device()
+    feed(timebase, 0, 50)
+    assert timebase.release(START_NS + HOLD_AT_START_NS - 1) == []
+    stamped = timebase.release(START_NS + HOLD_AT_START_NS)
+    assert [entry.sample.sequence for entry in stamped] == list(range(50))
+    assert timebase.release(START_NS + 10 * S) == []
+
+
+def test_the_end_of_a_take_lets_everything_go():
+    timebase = one_device()
+    feed(timebase, 0, 50)
+    assert [entry.sample.sequence for entry in timebase.flush()] == list(range(50))
+    assert timebase.flush() == []
+
+
+def test_a_sample_without_device_time_is_stamped_by_its_arrival_at_once():
+    timebase = one_device(latency_ns=2 * MS)
+    (entry,) = timebase.take("imu", START_NS + 7 * MS, imu(None))
+    assert entry.host_ns == START_NS + 5 * MS
+
+
+def test_latency_is_taken_off():
+    plain, delayed = one_device(), one_device(latency_ns=20 * MS)
+    without = feed(plain, 0, 400)
+    with_latency = feed(delayed, 0, 400, delay_ns=lambda index: FLOOR_NS + 20 * MS)
+    with_latency += delayed.flush()
+    assert [entry.host_ns for entry in without] == [entry.host_ns for entry in with_latency]
+
+
+def test_devices_of_one_clock_share_its_map_and_may_differ_in_latency():
+    timebase = Timebase(START_NS)
+    timebase.add_device("left", "cameras", 1e9, 0, 0)
+    timebase.add_device("right", "cameras", 1e9, 0, 30 * MS)
+    stamped: list[Stamped] = []
+    for index in range(100):
+        taken_ns = START_NS + index * 50 * MS
+        stamped += timebase.take("left", taken_ns + FLOOR_NS, imu(77 * S + index * 50 * MS, index))
+        stamped += timebase.take("right", taken_ns + FLOOR_NS + 30 * MS, imu(77 * S + index * 50 * MS + 100, index))
+    stamped += timebase.flush()
+    left = [entry for entry in stamped if entry.device == "left"]
+    right = [entry for entry in stamped if entry.device == "right"]
+    assert len(left) == len(right) == 100
+    for one, other in zip(left, right, strict=True):
+        assert other.device_ns - one.device_ns == 100
+        assert abs(other.host_ns - one.host_ns) < 0.1 * MS
+    assert list(timebase.clocks()) == ["cameras"]
+
+
+def test_a_restarted_device_begins_an_epoch_that_is_told_once_held_and_stamped_well():
+    timebase = one_device(wrap_bits=0)
+    gone, back = 1000, 1400
+    stamped = feed(timebase, 0, gone)
+    assert timebase.epochs_begun() == []
+    restart = -back * PERIOD_NS // 1000 + 5
+    known = back + 10
+    stamped += feed(timebase, back, known, ticks_at_0=restart)
+    assert timebase.epochs_begun() == [("imu", 1)]
+    assert timebase.epochs_begun() == []
+    before = len(stamped)
+    until = back + HOLD_NS // PERIOD_NS
+    stamped += feed(timebase, known, until, ticks_at_0=restart)
+    assert len(stamped) == before
+    stamped += feed(timebase, until, until + 400, ticks_at_0=restart)
+    assert [entry.sample.sequence for entry in stamped] == [*range(gone), *range(back, until + 400)]
+    assert max(map(abs, errors_ns(stamped))) < 2 * MS
+    times = [entry.host_ns for entry in stamped]
+    assert times == sorted(times)
+
+
+def test_a_wrapping_counter_runs_on():
+    timebase = one_device()
+    stamped = feed(timebase, 0, 1000, ticks_at_0=(1 << 32) - 1_500_000)
+    assert len(stamped) == 1000
+    assert max(map(abs, errors_ns(stamped))) < 0.1 * MS
+    assert timebase.epochs_begun() == []
+    assert timebase.clocks()["imu"].wraps == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 30 * MS), min_size=10, max_size=300), st.sampled_from([0, 5 * MS]))
+def test_nothing_is_lost_stamped_after_its_arrival_or_back_in_time(delays, latency_ns):
+    timebase = one_device(latency_ns=latency_ns)
+    arrivals = np.maximum.accumulate([truth_ns(index) + 6 * MS + delay for index, delay in enumerate(delays)]).tolist()
+    stamped = []
+    for index, arrival_ns in enumerate(arrivals):
+        stamped += timebase.take("imu", arrival_ns, imu(index * 5000, index))
+        stamped += timebase.release(arrival_ns)
+    stamped += timebase.flush()
+    assert [entry.sample.sequence for entry in stamped] == list(range(len(delays)))
+    times = [entry.host_ns for entry in stamped]
+    assert all(time <= arrival - latency_ns for time, arrival in zip(times, arrivals, strict=True))
+    assert times == sorted(times)
+
+
+def test_a_fix_is_stamped_by_the_clock_of_utc():
+    timebase = Timebase(START_NS)
+    timebase.add_device("gnss", "gnss", 1e9, 0, 0)
+    utc_ns = 1_700_000_000 * S
+    stamped = []
+    for index in range(30):
+        fix = FixSample(utc_ns + index * 100 * MS, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, "gst", 4, 9, 1.0, None)
+        stamped += timebase.take("gnss", START_NS + index * 100 * MS + 60 * MS, fix)
+    assert len(stamped) == 30
+    assert all(abs(entry.host_ns - (START_NS + index * 100 * MS + 60 * MS)) < MS for index, entry in enumerate(stamped))
+
+
+# -- scans --
+
+PACKETS, PACKET_NS = 630, 158_000
+LIDAR_TICKS_0 = 1_700_000_000_000_000  # microseconds of UTC, as a lidar sends them
+
+
+def scan_of(index: int) -> tuple[ClockPairs, ScanSample, int]:
+    """The packets of one frame with their arrivals, the frame, and the arrival of its last packet."""
+    taken_ns = index * 100 * MS + np.arange(PACKETS, dtype=np.int64) * PACKET_NS
+    ticks = LIDAR_TICKS_0 + taken_ns // 1000
+    arrival_ns = START_NS + taken_ns + FLOOR_NS
+    points = np.zeros(PACKETS * 2, POINT_DTYPE)
+    points["timestamp"] = np.repeat(ticks, 2) / 1e6
+    scan = ScanSample(points, int(ticks[0]), int(ticks[-1]), PACKETS, PACKETS, 0, is_partial=False)
+    return ClockPairs(ticks, arrival_ns), scan, int(arrival_ns[-1])
+
+
+def test_points_of_a_scan_get_host_times_of_their_own():
+    timebase = Timebase(START_NS)
+    timebase.add_device("lidar", "lidar", 1e6, 0, 0)
+    stamped: list[Stamped] = []
+    for index in range(15):
+        pairs, scan, arrival_ns = scan_of(index)
+        assert timebase.take("lidar", arrival_ns, pairs) == []
+        stamped += timebase.take("lidar", arrival_ns, scan)
+    assert len(stamped) == 15
+    for index, entry in enumerate(stamped):
+        wanted = START_NS + index * 100 * MS + np.repeat(np.arange(PACKETS, dtype=np.int64) * PACKET_NS, 2) + FLOOR_NS
+        assert np.abs(entry.point_host_ns - wanted).max() < 5_000
+        assert entry.host_ns == entry.point_host_ns.max()
+
+
+def test_a_scan_without_points_still_has_a_time():
+    timebase = Timebase(START_NS)
+    timebase.add_device("lidar", "lidar", 1e6, 0, 0)
+    pairs, scan, arrival_ns = scan_of(0)
+    empty = ScanSample(scan.points[:0], scan.first_ticks, scan.last_ticks, PACKETS, 0, 0, is_partial=False)
+    timebase.take("lidar", arrival_ns, pairs)
+    timebase.take("lidar", arrival_ns, empty)
+    (entry,) = timebase.flush()
+    assert entry.point_host_ns is None
+    assert abs(entry.host_ns - arrival_ns) < MS
+
+
+# -- pairs for the raw tape --
+
+
+def test_pairs_are_what_came_with_nothing_taken_off():
+    timebase = one_device(latency_ns=3 * MS)
+    feed(timebase, 0, 5)
+    pairs = timebase.take_pairs()["imu"]
+    assert pairs.tolist() == [[index * 5000, truth_ns(index) + FLOOR_NS] for index in range(5)]
+    assert timebase.take_pairs() == {}
+
+
+def test_pairs_of_packets_are_kept_once():
+    timebase = Timebase(START_NS)
+    timebase.add_device("lidar", "lidar", 1e6, 0, 2 * MS)
+    pairs, scan, arrival_ns = scan_of(0)
+    timebase.take("lidar", arrival_ns, pairs)
+    timebase.take("lidar", arrival_ns, scan)
+    taken = timebase.take_pairs()["lidar"]
+    assert np.array_equal(taken[:, 0], pairs.ticks)
+    assert np.array_equal(taken[:, 1], pairs.arrival_ns)
+
+
+def test_an_unknown_device_is_a_programming_error():
+    with pytest.raises(KeyError):
+        one_device().take("other", START_NS, imu(0))
