@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import overload
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from recorder.clock_refine import refine_epoch
 FAR = 1 << 61  # ticks and device times beyond this are garbage
 STEP_BACK_NS = 1 * S  # less is reordering
 SUSPECTS = 3  # this many consistent samples prove a restart
-MIN_BATCH = 12  # smaller ones are not worth numpy
+MIN_BATCH = 32  # smaller ones are not worth numpy
 NEVER_NS = -(1 << 63)
 
 
@@ -148,7 +148,7 @@ class ClockStream:
         estimator = self._estimator
         if not estimator.started and abs(self._ns(ticks)) < FAR:
             estimator.start(self._ns(ticks), arrival_ns)
-        unwrapped = self._choose_wrap(ticks, arrival_ns)
+        unwrapped = self._choose_wrap(ticks, arrival_ns) if estimator.started else ticks
         device_ns = self._axis_ns(unwrapped)
         if abs(device_ns) >= FAR:
             estimator.counts.rejected += 1
@@ -289,9 +289,10 @@ class ClockMap:
         prior_skew_ppm: float = 0.0,
         prior_sigma_ppm: float = 100.0,
         inline_refit: bool = True,
+        level: Literal["lowest", "model"] = "lowest",
     ):
         prior = SlopePrior(1 / (1 + prior_skew_ppm * PPM) - 1, max(prior_sigma_ppm, 1e-3) * PPM)
-        self._estimator = Estimator(prior, inline_refit)
+        self._estimator = Estimator(prior, inline_refit, level)
         self._stream = ClockStream(self._estimator, tick_hz, wrap_bits)
         self.map = self._stream.map
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock_fit import PPM, Bucket, Floats, Line, SlopePrior, blend, summarise
+from recorder.clock_polling import GridLine, PollingGrid
 
 Ints = NDArray[np.int64]
 
@@ -25,6 +26,9 @@ BUCKET_S = (0.05, 1.0, 5.0)  # shortest, usual, longest when samples are few
 BUCKET_SHARE = 0.1  # of the epoch's age while it is young
 BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
+IGNORE_TRUST, MIN_TRUST = 0.01, 0.5
+GRID_LEVEL = 0.02  # of the mean delay: what the place by the delay law may be wrong by
+GRID_LEVEL_S = 120  # the grid's curve is put on the lowest point of this last time
 REFIT_S = 2.0
 SLEW = ((5.0, 0.2), (30.0, 5e-3), (math.inf, 500 * PPM))  # up to this age of the epoch: seconds per second
 KEPT_SKEW_PPM = 2.0  # one sigma of a device's skew across a restart
@@ -81,13 +85,41 @@ class Counts:
     rejected: int = 0
 
 
+def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x: float) -> Line:
+    """The tangent at `now_x` of the grid's curve and the line beneath, mixed by trust.
+
+    level "lowest": the curve is moved to touch the lowest point, but not further above the place where the delay law
+    puts it than that may be wrong; "model": it lies there.
+    """
+    trust = grid.trust
+    if trust < IGNORE_TRUST:
+        return line
+    table = np.array(buckets, dtype=np.float64)
+    table = table[table[:, 6] > now_x - GRID_LEVEL_S * S]
+    low_x, low_y = table[:, 0], table[:, 1]
+    curve = trust * grid.at(low_x) + (1 - trust) * (line.offset + line.slope * low_x)
+    clearance = float((low_y - curve).min())
+    if level == "model":
+        clearance = min(clearance, 0.0)
+    elif trust > MIN_TRUST:
+        clearance = min(clearance, grid.sd_height + GRID_LEVEL * grid.law.mean_ns)
+    here = trust * float(grid.at(np.array([now_x]))[0]) + (1 - trust) * line.at(now_x) + clearance
+    slope = trust * (grid.slope + 2 * grid.curvature * (now_x - grid.pivot_x)) + (1 - trust) * line.slope
+    sd_slope = trust * grid.sd_slope + (1 - trust) * line.sd_slope
+    sd_level = trust * grid.sd_height + (1 - trust) * line.sigma_ns(now_x)
+    return Line(here - slope * now_x, slope, sd_slope, sd_level, now_x, line.spread_ns)
+
+
 class Estimator:
     """The line between one device clock and the host's.
 
     Calls must not overlap, but `refit` may run in another thread than the rest.
     """
 
-    def __init__(self, prior: SlopePrior, inline_refit: bool):
+    def __init__(self, prior: SlopePrior, inline_refit: bool, level: str = "lowest"):
+        self.level = level
+        self.grid = PollingGrid()
+        self.grid_line: GridLine | None = None
         self.inline_refit = inline_refit
         self.refit_due = False
         self.counts = Counts()
@@ -161,6 +193,7 @@ class Estimator:
         self.early_ns = float(LATE_NS)
         self.last_x = x
         self.refit_due = False
+        self.grid.restart()
         self._prior = prior
         self._begin_x = x
         self._next_refit_x = x
@@ -226,8 +259,10 @@ class Estimator:
         if thin and last - self._open_x[0] < self._pace_ns(BUCKET_S[2]):
             self._open_end = last
             return
-        bucket = summarise(*self._open_points(), self.fit.slope)
+        x, y = self._open_points()
+        bucket = summarise(x, y, self.fit.slope)
         self._buckets.append(bucket)
+        self.grid.feed(x, y, self.fit.slope)
         self._open_x, self._open_y = [], []
         self._open_end = last + self._pace_ns(BUCKET_S[1])
         while last - self._buckets[0].last_x > WINDOW_S * S:
@@ -262,7 +297,11 @@ class Estimator:
         self.refit_due = False
         epoch, buckets, prior = self.epoch, self._buckets[:], self._prior
         if buckets:
-            self._ready = (epoch, blend(buckets, prior))
+            line = blend(buckets, prior)
+            self.grid_line = self.grid.fit(line, prior)
+            if self.grid_line is not None:
+                line = combine(line, self.grid_line, buckets, self.level, self.last_x)
+            self._ready = (epoch, line)
 
     def _adopt(self) -> None:
         """Take over a finished refit, below what has come since."""

@@ -26,13 +26,15 @@ Floats = NDArray[np.float64]
 
 S = 1e9  # ns
 PPM = 1e-6
-TRIM = 0.8  # share of a bucket, counted from the least delayed sample, that its mean is taken over
+CLIP = (
+    3.0  # delays further above the median than this many spreads count as such; a trimmed mean would follow the polls
+)
 SHRINK = 0.6
 FIRST_WINDOW_S = 20.0  # the window is not cut below this
 
 
 class Bucket(NamedTuple):
-    """About a second of samples: the least delayed one, and the trimmed mean of all."""
+    """About a second of samples: the least delayed one, and the mean of all with long delays clipped."""
 
     low_x: float
     low_y: float
@@ -83,10 +85,11 @@ def summarise(x: Floats, y: Floats, slope: float) -> Bucket:
     """Condense samples into one bucket; heights are compared along `slope`."""
     height = y - slope * (x - x[0])
     low = int(np.argmin(height))
-    keep = np.argsort(height, kind="stable")[: max(1, math.ceil(TRIM * height.size))]
-    mean_x = float(x[keep].mean())
-    mean_y = float(height[keep].mean()) + slope * (mean_x - float(x[0]))
-    sd = float(height[keep].std()) / math.sqrt(keep.size)
+    quarter, half, most = np.quantile(height, (0.25, 0.5, 0.75)) if height.size > 1 else (height[0],) * 3
+    clipped = np.minimum(height, half + CLIP * max(most - quarter, half - height[low]))
+    mean_x = float(x.mean())
+    mean_y = float(clipped.mean()) + slope * (mean_x - float(x[0]))
+    sd = float(clipped.std()) / math.sqrt(height.size)
     return Bucket(float(x[low]), float(y[low]), mean_x, mean_y, sd, float(x.size), float(x[-1]))
 
 
@@ -145,9 +148,10 @@ def mean_slope(x: Floats, y: Floats, sd: Floats) -> tuple[float, float]:
             return 0.0, math.inf
     rest_signed = (y - cy - slope * dx) * (weight > 0)
     power = float(rest_signed @ rest_signed)
-    rho = float(rest_signed[1:] @ rest_signed[:-1]) / power if power > 0 else 0.0
-    rho = min(max(rho, 0.0), 0.9)
-    return slope, scale / math.sqrt(moment) * math.sqrt((1 + rho) / (1 - rho)) * 1.1
+    # slow changes of the delay leave long runs of one sign: so many independent points are there (Wald-Wolfowitz)
+    runs = 1 + int(np.count_nonzero(np.diff(np.sign(rest_signed))))
+    sigma = math.sqrt(power / max(int(np.count_nonzero(weight)), 1) / moment)
+    return slope, sigma * math.sqrt(x.size / min(x.size, 2 * runs))
 
 
 def blend(buckets: list[Bucket], prior: SlopePrior) -> Line:
@@ -171,16 +175,16 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float) -> tuple[Line,
     span = max(float(low_x[-1] - low_x[0]), 1.0)
     flat = mean_y - low_y - prior.slope * (mean_x - low_x)
     spread = max(float(np.median(flat)), 1.0)
+    minutes = span / (60 * S)
     weight = [1 / prior.sigma**2]
     slopes = [prior.slope]
     slope_means, sd_means = mean_slope(mean_x, mean_y, sd_mean)
     if math.isfinite(sd_means):
-        age = span / (60 * S)
-        sd_means = math.hypot(sd_means, 0.02 * spread / span) * (1 + age**2)
+        sd_means = math.hypot(sd_means, 0.02 * spread / span) * (1 + minutes**1.25)
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
-            sd_hull = 0.3 * spread / span * (1 + span / (2 * length))
+            sd_hull = 2.5 / (1 + minutes) * spread / span * (1 + span / (2 * length))
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
             slopes.append(slope_hull)

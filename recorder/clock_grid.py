@@ -1,0 +1,353 @@
+"""The polling grid: a host that polls a link (USB frames, latency timers) sees arrivals only at its polls.
+
+With the polls at E_k = phase + k * period, a sample whose event (plus least delay) is at t is seen at the first poll
+after t + delay.  Put D = E_k - t: the poll k is seen with probability F(D) - F(D - period), where F is the law of the
+delay.  How often a phase is seen at one poll and how often at the next tells more about t than the least delayed
+arrivals do, and unlike them it does not slide along with the polls' clock.  This is maximum likelihood for interval
+censored data (Turnbull, "The empirical distribution function with arbitrarily grouped, censored and truncated data",
+JRSS B 38, 1976), here with a smooth law: a gamma law with an exponential tail.
+
+`GridTracker` finds and follows the polls, `IntervalFit` fits offset and law, `trust` says how far to believe it.
+Times are ns as float64 since an anchor; offsets are relative to a line given by the caller.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorder.clock_fit import Floats
+
+Ints = NDArray[np.int64]
+
+S = 1e9  # ns
+PERIODS_NS = (16e6, 10e6, 8e6, 4e6, 2e6, 1e6, 0.5e6, 0.25e6, 0.125e6)
+CHUNK = 20  # arrivals whose phases are averaged when looking for a period
+CHUNKS = 8
+FORGET = 0.97
+ORDER = 0.75**2  # squared resultant length that makes a period a candidate
+MAX_PER_BUCKET = 400  # arrivals looked at while searching
+WALK = 1e-8 / math.sqrt(S)  # random walk of the polls' relative frequency, per sqrt(ns)
+MAX_FREQUENCY = 4e-4
+LOST_PIECES = 7
+OFF_GRID = 0.015  # of the period: a bucket further from its polls belongs to another grid
+CELLS_PER_PERIOD = 40
+RESIDUES = 30
+
+SHAPES = np.geomspace(0.5, 10.0, 73)  # of the gamma law
+UNITS = np.linspace(0.0, 7.0, 280) ** 2  # delays in units of the law's scale
+LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log ratio of the tail's mean
+LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(5.0)])
+LAW_SIGMA = np.array([0.5, 50.0, 1.5, 0.7])
+OUTLIERS = 2e-4
+SOFT_EDGE = 0.02  # of the period: how fast "earlier than possible" becomes impossible
+STEPS = 6
+
+
+def _gamma_table() -> Floats:
+    """(shapes, units): gamma distribution function by its power series (Abramowitz and Stegun 6.5.29)."""
+    table = np.empty((SHAPES.size, UNITS.size))
+    n = np.arange(1, 140)
+    for row, shape in zip(table, SHAPES, strict=True):
+        terms = np.cumprod(UNITS[:, None] / (shape + n), axis=1).sum(axis=1) + 1
+        log_lead = shape * np.log(np.maximum(UNITS, 1e-300)) - UNITS - math.lgamma(shape + 1)
+        row[:] = np.minimum(np.exp(log_lead) * terms, 1.0)
+    return table
+
+
+_TABLE = _gamma_table()
+
+
+@dataclass(frozen=True, slots=True)
+class GridPoints:
+    """Arrivals of one bucket snapped to their polls, condensed: mean x, mean y and count of each cell."""
+
+    x: Floats
+    y: Floats
+    count: Floats
+    residues: Ints  # how many polls have each index modulo RESIDUES
+    jitter_ns: float
+
+
+# -- the delay law ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class DelayLaw:
+    """(1 - weight) gamma(shape, scale) + weight exponential(ratio * shape * scale)."""
+
+    shape: float
+    scale: float
+    weight: float
+    ratio: float
+
+    @classmethod
+    def of(cls, law: Floats) -> DelayLaw:
+        """From the four unbounded parameters."""
+        shape = math.exp(min(max(law[0], math.log(0.8)), math.log(8.0)))
+        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), math.exp(law[3]))
+
+    @property
+    def mean_ns(self) -> float:
+        """Mean delay above the floor."""
+        return self.shape * self.scale * (1 + self.weight * (self.ratio - 1))
+
+    def cdf(self, delay: Floats) -> tuple[Floats, Floats]:
+        """F and its derivatives (n, 1 + LAW) by the delay and by the parameters."""
+        k, theta, w = self.shape, self.scale, self.weight
+        delay = np.maximum(delay, 0.0)
+        unit = delay / theta
+        at = np.interp(math.log(k), np.log(SHAPES), np.arange(SHAPES.size))
+        row = min(int(at), SHAPES.size - 2)
+        low, high = _TABLE[row], _TABLE[row + 1]
+        step = math.log(SHAPES[1] / SHAPES[0])
+        body = np.interp(unit, UNITS, low + (at - row) * (high - low), right=1.0)
+        body_by_shape = np.interp(unit, UNITS, (high - low) / step, right=0.0)
+        log_density = (k - 1) * np.log(np.maximum(unit, 1e-9)) - unit - math.lgamma(k)
+        body_density = np.exp(np.minimum(log_density, 10.0)) / theta * (delay > 0)
+        mean = self.ratio * k * theta
+        decay = np.exp(-delay / mean)
+        tail_density = decay / mean * (delay > 0)
+        density = (1 - w) * body_density + w * tail_density
+        by_tail = -w * delay * tail_density
+        by_weight = (1 - decay - body) * w * (1 - 2 * w)
+        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_tail], axis=1)
+        return (1 - w) * body + w * (1 - decay), slopes
+
+    def seen(self, distance: Floats, period: float) -> tuple[Floats, Floats]:
+        """Probability of the poll at `distance` after the event, and its derivatives like `cdf`."""
+        n = distance.size
+        value, slopes = self.cdf(np.concatenate([distance, distance - period]))
+        soft = OUTLIERS * np.exp(np.clip(distance / (SOFT_EDGE * period), -300.0, 0.0))
+        by = slopes[:n] - slopes[n:]
+        by[:, 0] += soft / (SOFT_EDGE * period) * (distance < 0)
+        return np.maximum(value[:n] - value[n:], 0.0) + soft, by
+
+
+# -- fitting ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class IntervalFit:
+    """Most likely offset function and delay law.
+
+    basis (n, p): the offset is `basis @ weights`; height (n,): seen poll minus event by the caller's line;
+    centre, precision: Gaussian prior of the weights.
+    """
+
+    basis: Floats
+    height: Floats
+    count: Floats
+    period: float
+    centre: Floats
+    precision: Floats
+
+    def objective(self, weights: Floats, law: Floats) -> tuple[float, Floats, Floats]:
+        """Log posterior, its gradient and the information matrix (outer product of scores)."""
+        p = weights.size
+        seen, slopes = DelayLaw.of(law).seen(self.height - self.basis @ weights, self.period)
+        slopes /= seen[:, None]
+        score = np.concatenate([-slopes[:, :1] * self.basis, slopes[:, 1:]], axis=1)
+        weighted = score * self.count[:, None]
+        off, law_off = weights - self.centre, (law - LAW_PRIOR) / LAW_SIGMA
+        pull = self.precision @ off
+        value = float(self.count @ np.log(seen)) - 0.5 * float(off @ pull) - 0.5 * float(law_off @ law_off)
+        gradient = weighted.sum(axis=0)
+        gradient[:p] -= pull
+        gradient[p:] -= law_off / LAW_SIGMA
+        information = weighted.T @ score
+        information[:p, :p] += self.precision
+        information[np.arange(p, p + LAW), np.arange(p, p + LAW)] += LAW_SIGMA**-2
+        return value, gradient, information
+
+    def value(self, weights: Floats, law: Floats) -> float:
+        """Log posterior."""
+        return self.objective(weights, law)[0]
+
+    def climb(self, weights: Floats, law: Floats, steps: int = STEPS) -> Fitted:
+        """Damped Fisher scoring from a start."""
+        p = weights.size
+        value, gradient, information = self.objective(weights, law)
+        damping = 1e-3
+        for _ in range(steps):
+            matrix = information + damping * np.diag(np.diag(information))
+            step = np.linalg.solve(matrix, gradient)
+            step[p:] = np.clip(step[p:], -0.7, 0.7)
+            trial_weights, trial_law = weights + step[:p], law + step[p:]
+            trial = self.objective(trial_weights, trial_law)
+            if trial[0] > value:
+                gain = trial[0] - value
+                weights, law, (value, gradient, information) = trial_weights, trial_law, trial
+                damping = max(damping / 5, 1e-6)
+                if gain < 1e-2:
+                    break
+            else:
+                damping = min(damping * 20, 1e4)
+        return Fitted(weights, law, value, information)
+
+    def bucket_test(self, law: Floats, weights: Floats, bucket: Ints, count: Floats) -> NDArray[np.bool_]:
+        """Per bucket: whether the law explains it better than delays four times as long would."""
+        distance = self.height - self.basis @ weights
+        kind = DelayLaw.of(law)
+        slow = np.diff(
+            np.exp(-np.maximum(np.stack([distance, distance - self.period]), 0) / (4 * kind.mean_ns)), axis=0
+        )[0]
+        soft = OUTLIERS * np.exp(np.clip(distance / (SOFT_EDGE * self.period), -300.0, 0.0))
+        gain = count * np.log(kind.seen(distance, self.period)[0] / (slow + soft))
+        better: NDArray[np.bool_] = np.bincount(bucket, gain) > 0
+        return better
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A maximum: weights of the basis, parameters of the law, log posterior, information."""
+
+    weights: Floats
+    law: Floats
+    value: float
+    information: Floats
+
+
+# -- finding and following the polls ----------------------------------------------------------------------------------
+
+
+class GridTracker:
+    """Finds the polling period in arrivals, then follows phase and frequency with a Kalman filter.
+
+    Several clocks whose links are polled by one controller may share a tracker.
+    """
+
+    def __init__(self) -> None:
+        self.period_ns = 0.0  # nominal; 0 while none is found
+        self._forget()
+
+    def _forget(self) -> None:
+        self.period_ns = 0.0
+        self._power = np.zeros(len(PERIODS_NS))
+        self._chunks = 0
+        self._recent = np.empty(0)
+        self._edge = 0.0  # time of a poll
+        self._edge_index = 0
+        self._frequency = 0.0  # how much longer than nominal the period is, relative
+        self._covariance = np.zeros((2, 2))  # of edge (ns) and frequency
+        self._lost = 0
+
+    def feed(self, arrival: Floats) -> tuple[Floats, NDArray[np.bool_], Ints, float] | None:
+        """Follow ascending arrivals: their polls, whether they lie on them, the polls' indices, the jitter."""
+        if not self.period_ns:
+            self._search(arrival)
+            return None
+        polls, on_grid = np.empty_like(arrival), np.zeros(arrival.size, dtype=np.bool_)
+        index = np.zeros(arrival.size, dtype=np.int64)
+        jitter, start = 0.0, 0
+        while start < arrival.size and self.period_ns:
+            length = 0.1 * self.period_ns / max(math.sqrt(self._covariance[1, 1]), 1e-9)
+            length = min(max(length, 0.05 * S), 1.0 * S)
+            stop = max(int(np.searchsorted(arrival, arrival[start] + length)), start + 1)
+            if arrival.size - stop < CHUNK // 2:
+                stop = arrival.size
+            part = slice(start, stop)
+            polls[part], on_grid[part], index[part], jitter = self._follow(arrival[part])
+            start = stop
+        return polls, on_grid, index, jitter
+
+    def _search(self, arrival: Floats) -> None:
+        fresh = np.unique(arrival[:MAX_PER_BUCKET])
+        seen = np.concatenate([self._recent, fresh])
+        new = (fresh.size + self._recent.size % CHUNK) // CHUNK
+        periods = np.array(PERIODS_NS)
+        for i in range(new):
+            end = seen.size - (seen.size % CHUNK) - (new - 1 - i) * CHUNK
+            chunk = seen[max(end - CHUNK, 0) : end]
+            if chunk.size < CHUNK:
+                continue
+            phasor = np.exp(2j * np.pi * ((chunk[:, None] % periods) / periods)).mean(axis=0)
+            power = (CHUNK * np.abs(phasor) ** 2 - 1) / (CHUNK - 1)
+            self._power = FORGET * self._power + (1 - FORGET) * power
+            self._chunks += 1
+        keep = CHUNK * CHUNKS + seen.size % CHUNK
+        self._recent = seen[-keep:]
+        if self._chunks >= CHUNKS:
+            self._choose(self._power / (1 - FORGET**self._chunks) > ORDER)
+
+    def _choose(self, candidates: NDArray[np.bool_]) -> None:
+        """Of the candidates the longest period whose arrivals are within twice the sharpest one's of its polls."""
+        found: list[tuple[float, float, float]] = []
+        for period in np.array(PERIODS_NS)[candidates]:
+            last = self._recent[-3 * CHUNK :]
+            phase = np.angle(np.exp(2j * np.pi * ((last % period) / period)).mean()) / (2 * np.pi) * period
+            rest = (last - phase + period / 2) % period - period / 2
+            found.append(
+                (float(np.median(np.abs(rest - np.median(rest)))), float(period), phase + float(np.median(rest)))
+            )
+        if not found:
+            return
+        sharpest = min(found)[0]
+        _, period, phase = max((f for f in found if f[0] <= 2 * sharpest + 1e3), key=lambda f: f[1])
+        last_arrival = float(self._recent[-1])
+        self.period_ns = period
+        self._edge = phase + math.floor((last_arrival - phase) / period) * period
+        self._edge_index = round(self._edge / period)
+        self._frequency = 0.0
+        self._covariance = np.diag([(0.1 * period) ** 2, (50e-6) ** 2])
+        self._lost = 0
+
+    def _follow(self, arrival: Floats) -> tuple[Floats, NDArray[np.bool_], Ints, float]:
+        middle = float(arrival.mean())
+        period = self.period_ns * (1 + self._frequency)
+        steps = round((middle - self._edge) / period)
+        elapsed = steps * self.period_ns
+        transition = np.array([[1.0, elapsed], [0.0, 1.0]])
+        walk = WALK**2 * abs(elapsed)
+        noise = np.array([[elapsed**2 / 3, elapsed / 2], [elapsed / 2, 1.0]]) * walk
+        covariance = transition @ self._covariance @ transition.T + noise
+        edge = self._edge + steps * period
+        rest = (arrival - edge + period / 2) % period - period / 2
+        low, high = np.quantile(rest, (0.25, 0.75))
+        reach = min(max(5 * (high - low), 0.02 * period), 0.3 * period)
+        on_grid = np.abs(rest - low) < reach
+        spread = max(float(high - low), 1e-3 * period)
+        variance = covariance[0, 0] + 2 * spread**2 / arrival.size
+        if abs(low) > 4 * math.sqrt(variance) + OFF_GRID * period:
+            on_grid[:] = False  # regular, but not with these polls
+        if on_grid.mean() >= 0.5:
+            self._lost = 0
+            quantiles = np.quantile(rest[on_grid], (0.25, 0.75))
+            spread = max(float(quantiles[1] - quantiles[0]), 1e-3 * period)
+            gain = covariance[:, 0] / (covariance[0, 0] + 2 * spread**2 / on_grid.sum())
+            change = gain * quantiles[0]
+            edge += change[0]
+            self._frequency += change[1]
+            covariance = covariance - np.outer(gain, covariance[0])
+        else:
+            self._lost += 1
+            on_grid[:] = False
+        self._edge, self._edge_index, self._covariance = edge, self._edge_index + steps, covariance
+        away = np.rint((arrival - edge) / period)
+        polls = edge + away * period
+        index = self._edge_index + away.astype(np.int64)
+        if self._lost >= LOST_PIECES or abs(self._frequency) > MAX_FREQUENCY:
+            self._forget()
+        return polls, on_grid, index, spread
+
+
+def snap(x: Floats, y: Floats, slope: float, tracker: GridTracker) -> GridPoints | None:
+    """One bucket's samples on their polls, or nothing without a grid."""
+    order = np.argsort(x + y, kind="stable")
+    x, arrival = x[order], (x + y)[order]
+    followed = tracker.feed(arrival)
+    if followed is None or not tracker.period_ns or not followed[1].any():
+        return None
+    polls, on_grid, index, jitter = followed
+    x, index = x[on_grid], index[on_grid]
+    y = polls[on_grid] - x
+    residues = np.bincount(index % RESIDUES, minlength=RESIDUES)
+    if x.size <= 2 * CELLS_PER_PERIOD:
+        return GridPoints(x, y, np.ones_like(x), residues, jitter)
+    cell = np.floor((y - slope * (x - x[0])) * (CELLS_PER_PERIOD / tracker.period_ns)).astype(np.int64)
+    _, cell, count = np.unique(cell, return_inverse=True, return_counts=True)
+    mean_x, mean_y = np.bincount(cell, x) / count, np.bincount(cell, y) / count
+    return GridPoints(mean_x, mean_y, count.astype(np.float64), residues, jitter)

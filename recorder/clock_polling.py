@@ -1,0 +1,274 @@
+"""The polling grid as a stage over the line under the arrivals: slope and curvature from it where it can be trusted.
+
+The grid is tracked and its points are kept all the time; with each refit the interval likelihood of
+`recorder.clock_grid` is fitted to the last two minutes.  How far it is believed is a number from 0 to 1: misfit of the
+delay law, delays that change with the load, points left out and the fit's own sigma all lower it.  The rest of the
+weight stays with the line beneath.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from recorder.clock_fit import Floats, Line, SlopePrior
+from recorder.clock_grid import (
+    RESIDUES,
+    DelayLaw,
+    Fitted,
+    GridPoints,
+    GridTracker,
+    IntervalFit,
+    Ints,
+    snap,
+)
+
+S = 1e9  # ns
+WINDOW_S = 120.0
+MIN_SPAN_S = 1.5
+YOUNG_S = 20.0
+CURVATURE = (1.0, 10.0, 40.0)  # one sigma of the curvature, ns/s^2: least, at first, most
+FREE = 1e12
+STARTS = (0.05, 0.3, 0.6)  # of the period below the lowest point
+FIRST_LAW = np.array([math.log(1.5), 0.0, -3.0, math.log(5.0)])
+MIN_KEPT = 0.35
+FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
+WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
+BLOCK_S = 5.0
+COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows unless the delays are longer still
+
+
+@dataclass(frozen=True, slots=True)
+class GridLine:
+    """What the grid says: height (ns), slope and curvature (per ns) at `pivot_x`, one sigma of each, and the trust."""
+
+    pivot_x: float
+    height: float
+    slope: float
+    curvature: float
+    sd_height: float
+    sd_slope: float
+    trust: float
+    law: DelayLaw
+
+    def at(self, x: Floats) -> Floats:
+        """Offset at x, ns."""
+        dx = x - self.pivot_x
+        return self.height + self.slope * dx + self.curvature * dx**2
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """Where the last fit ended, in absolute terms."""
+
+    pivot_x: float
+    height: float
+    slope: float
+    curvature: float
+    law: Floats
+
+
+class PollingGrid:
+    """Points on the polls of one clock's link and the fit to them."""
+
+    def __init__(self, tracker: GridTracker | None = None):
+        self.tracker = tracker or GridTracker()
+        self.points: list[GridPoints] = []
+        self._last: _Start | None = None
+        self._load = 0.0
+        self._fits = 0
+        self._bending = CURVATURE[1] ** 2  # variance of the curvature, learnt from its estimates
+
+    def restart(self) -> None:
+        """A new sync epoch: the polls go on, the points and the level do not."""
+        self.points = []
+        self._last = None
+
+    def feed(self, x: Floats, y: Floats, slope: float) -> None:
+        """Learn from a bucket's samples."""
+        period = self.tracker.period_ns
+        points = snap(x, y, slope, self.tracker)
+        if self.tracker.period_ns != period:
+            self.restart()
+        elif points is not None:
+            self.points.append(points)
+            while x[-1] - self.points[0].x[0] > 1.1 * WINDOW_S * S:
+                del self.points[0]
+
+    def fit(self, line: Line, prior: SlopePrior) -> GridLine | None:
+        """The grid's curve near `line`, or nothing when there is no grid worth using."""
+        points, period = self.points[:], self.tracker.period_ns
+        if not points or not period:
+            return None
+        end = float(points[-1].x.max())
+        points = [p for p in points if p.x[-1] > end - WINDOW_S * S]
+        x, y, count = (np.concatenate([getattr(p, name) for p in points]) for name in ("x", "y", "count"))
+        span_s = (end - float(x.min())) / S
+        if span_s < MIN_SPAN_S or count.sum() < 50:
+            return None
+        bucket = np.repeat(np.arange(len(points)), [p.x.size for p in points])
+        t = (x - end) / S
+        height = y - line.offset - line.slope * x
+        basis = np.stack([np.ones_like(t), t, t**2], axis=1)
+        centre = np.array([0.0, (prior.slope - line.slope) * S, 0.0])
+        precision = np.diag([FREE**-2, (prior.sigma * S) ** -2, 1 / self._bending])
+        problem = IntervalFit(basis, height, count, period, centre, precision)
+        best = self._climb(problem, span_s, line, end, bucket)
+        if best is None:
+            return None
+        fitted, kept = best
+        covariance = np.asarray(np.linalg.inv(fitted.information), dtype=np.float64)
+        self._learn_bending(fitted.weights[2], covariance[2, 2])
+        self._last = _Start(
+            end,
+            line.at(end) + fitted.weights[0],
+            line.slope + fitted.weights[1] / S,
+            fitted.weights[2] / S**2,
+            fitted.law,
+        )
+        jitter = float(np.median([p.jitter_ns for p in points]))
+        trust, sd = self._trust(problem, fitted, covariance, kept, t, jitter)
+        residues = np.sum([p.residues for p in points], axis=0)
+        if _on_coarser_grid(residues):
+            trust = 0.0
+        return GridLine(
+            end,
+            self._last.height,
+            self._last.slope,
+            self._last.curvature,
+            sd[0],
+            sd[1] / S,
+            trust,
+            DelayLaw.of(fitted.law),
+        )
+
+    def _climb(
+        self, problem: IntervalFit, span_s: float, line: Line, end: float, bucket: Ints
+    ) -> tuple[Fitted, Floats] | None:
+        """The best maximum from the last one and, while young, from fresh starts; late buckets left out."""
+        everything = problem.count
+        starts: list[tuple[Floats, Floats]] = []
+        last, low = self._last, float(problem.height.min())
+        if last is not None:
+            dx = end - last.pivot_x
+            slope = last.slope + 2 * last.curvature * dx
+            height = last.height + last.slope * dx + last.curvature * dx**2
+            weights = np.array([height - line.at(end), (slope - line.slope) * S, last.curvature * S**2])
+            if float((problem.height - problem.basis @ weights).min()) > -FAR_OFF * problem.period:
+                starts.append((weights, last.law))
+                problem.count = _without_late(problem, everything, weights, last.law, bucket)
+        self._fits += 1
+        if not starts or span_s < YOUNG_S or self._fits % 8 == 0:
+            mean = float(problem.count @ problem.height / problem.count.sum()) - low
+            law = FIRST_LAW + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
+            starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in STARTS]
+        best = max((problem.climb(*start) for start in starts), key=lambda fit: fit.value)
+        if not math.isfinite(best.value):
+            return None
+        kept = _without_late(problem, everything, best.weights, best.law, bucket)
+        if (kept != problem.count).any():
+            problem.count = kept
+            best = problem.climb(best.weights, best.law)
+        return best, problem.count
+
+    def _learn_bending(self, curvature: float, variance: float) -> None:
+        """Most oscillators are steady and some warm up: the curvature's prior follows its estimates without prior."""
+        information = max(1 / variance - 1 / self._bending, 1e-12)
+        free, noise = curvature / (variance * information), 1 / information
+        least, _, most = CURVATURE
+        weight = 0.1 * min(1.0, self._bending / noise)
+        self._bending += weight * (min(max(free**2 - noise, least**2), most**2) - self._bending)
+
+    def _trust(
+        self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats, jitter: float
+    ) -> tuple[float, tuple[float, float]]:
+        """How far to believe the fit, and one sigma of its height and slope at the newest end."""
+        distance = problem.height - problem.basis @ fitted.weights
+        law = DelayLaw.of(fitted.law)
+        sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance))
+        sd_slope = math.sqrt(max(covariance[1, 1], 0.0))
+        low, high = _weighted_quantiles(distance, kept, (0.1, 0.9))
+        if high - low < WIDE * jitter:
+            return 0.0, (sd, sd_slope)
+        upper, _ = law.cdf(distance)
+        lower, _ = law.cdf(distance - problem.period)
+        kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
+        misfit = _misfit(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
+        self._load = max(0.85 * self._load, _load_dependence(lower, upper, kept, t))
+        share = float(kept.sum()) / max(float(sum(p.count.sum() for p in self.points)), 1.0)
+        self.misfit = misfit
+        trust = _ramp(misfit, 0.025, 0.045) * _ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
+        if problem.period > COARSE_NS:
+            trust *= _ramp(law.mean_ns / problem.period, 0.25, 0.1)
+        return trust / (1 + (sd / (0.4 * problem.period)) ** 2), (sd, sd_slope)
+
+    def _flatness(self, problem: IntervalFit, fitted: Fitted, covariance: Floats) -> float:
+        """Sigma of the height by trying: before a phase has been seen at two polls the likelihood has a plateau."""
+        towards = covariance[:, 0] / covariance[0, 0]
+        p, sigma = problem.centre.size, 0.0
+        for shift in (-0.35, -0.15, 0.15, 0.35):
+            move = shift * problem.period * towards
+            law = fitted.law + np.clip(move[p:], -1.0, 1.0)
+            drop = fitted.value - problem.value(fitted.weights + move[:p], law)
+            sigma = max(sigma, abs(shift) * problem.period / math.sqrt(2 * max(drop, 0.5)))
+        return sigma
+
+
+def _without_late(problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints) -> Floats:
+    """Counts with the buckets zeroed whose delays are of another kind, unless these are the most."""
+    good = problem.bucket_test(law, weights, bucket, count)[bucket]
+    return np.where(good, count, 0.0) if count[good].sum() > MIN_KEPT * count.sum() else count
+
+
+def _ramp(value: float, good: float, bad: float) -> float:
+    return min(max((bad - value) / (bad - good), 0.0), 1.0)
+
+
+def _weighted_quantiles(values: Floats, weight: Floats, shares: tuple[float, ...]) -> list[float]:
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return [float(values[order][min(np.searchsorted(total, q * total[-1]), values.size - 1)]) for q in shares]
+
+
+def _misfit(lower: Floats, upper: Floats, count: Floats, phase: Floats) -> float:
+    """Distance of the probability integral transforms from uniform, by quarter of the phase.
+
+    For interval data each sample's transform is spread over its interval (Czado, Gneiting, Held, "Predictive model
+    assessment for count data", Biometrics 65, 2009, section 2.1).
+    """
+    levels = np.linspace(0.02, 0.98, 33)
+    width = np.maximum(upper - lower, 1e-9)
+    quarter = np.minimum((4 * phase).astype(np.int64), 3)
+    distances = []
+    for i in range(4):
+        chosen = (quarter == i) & (count > 0)
+        total = float(count[chosen].sum())
+        if total < 100:
+            continue
+        share = np.clip((levels - lower[chosen, None]) / width[chosen, None], 0, 1)
+        distances.append(float(np.abs(count[chosen] @ share / total - levels).max()))
+    return float(np.mean(distances)) if distances else 0.0
+
+
+def _load_dependence(lower: Floats, upper: Floats, count: Floats, t: Floats) -> float:
+    """How much blocks of seconds differ in their mean transform beyond chance; the worst sixth left out."""
+    block = np.floor((t - t.min()) / BLOCK_S).astype(np.int64)
+    total = np.bincount(block, count)
+    middle, width = 0.5 * (lower + upper), upper - lower
+    mean = np.bincount(block, count * (middle - 0.5)) / np.maximum(total, 1)
+    chance = np.maximum(1 - np.bincount(block, count * width**2) / np.maximum(total, 1), 0) / 12 / np.maximum(total, 1)
+    excess = np.sort((mean**2 - chance)[total > 50])
+    excess = excess[: max(1, excess.size - excess.size // 6)]
+    return math.sqrt(max(float(excess.mean()), 0.0)) if excess.size > 2 else 0.0
+
+
+def _on_coarser_grid(residues: Ints) -> bool:
+    """All polls that brought something share a residue: the true period is a multiple of the one found."""
+    total = residues.sum()
+    for factor in (2, 3, 5):
+        share = residues.reshape(RESIDUES // factor, factor).sum(axis=0)
+        if share.max() > 0.995 * total:
+            return True
+    return False
