@@ -9,7 +9,6 @@ import math
 import socket
 import time
 from collections import deque
-from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -49,20 +48,21 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ClientStream:
-    """What the container writes to: a client's socket. A client that left or does not read is `gone`."""
+    """What the container writes to: bytes for a client, kept until they are taken to be sent."""
 
-    def __init__(self, client: socket.socket) -> None:
-        self.gone = False
-        self._client = client
+    def __init__(self) -> None:
+        self._data = bytearray()
 
     def write(self, data: bytes) -> int:
-        """Send all of `data`."""
-        if not self.gone:
-            try:
-                self._client.sendall(data)
-            except OSError:
-                self.gone = True
+        """Keep `data`."""
+        self._data += data
         return len(data)
+
+    def take(self) -> bytes:
+        """What has been written since the last time."""
+        taken = bytes(self._data)
+        self._data.clear()
+        return taken
 
 
 class PictureEncoder:
@@ -97,13 +97,22 @@ class PictureEncoder:
         (packet,) = self._stream.encode(frame)
         return packet
 
-    def send(self, packet: Packet[VideoStream]) -> None:
-        """Write the packet out at once."""
+    def write(self, packet: Packet[VideoStream]) -> None:
+        """Write the packet to the target, before the first one the stream's header."""
         self._container.mux(packet)
 
     def close(self) -> None:
         """End the stream."""
         self._container.close()
+
+
+def send_all(client: socket.socket, data: bytes) -> bool:
+    """Send `data`; False when the client has left, or does not read."""
+    try:
+        client.sendall(data)
+    except OSError:
+        return False
+    return True
 
 
 class CameraSimulator:
@@ -154,32 +163,35 @@ class CameraSimulator:
                 client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 client.settimeout(_CLIENT_STUCK_S)
                 self.opened.set()
-                self._serve(ClientStream(client))
+                self._serve(client)
 
-    def _serve(self, target: ClientStream) -> None:
+    def _serve(self, client: socket.socket) -> None:
         """Send pictures until the client is gone; draw the next one whenever there is time for it before a send."""
-        encoder = PictureEncoder(target, self._camera.width, self._camera.height, self._fps)
+        stream = ClientStream()
+        encoder = PictureEncoder(stream, self._camera.width, self._camera.height, self._fps)
         ahead = max(2, math.ceil(_LOOKAHEAD_S * self._fps))
-        waiting: deque[tuple[int, Packet[VideoStream]]] = deque()
+        waiting: deque[tuple[int, bytes]] = deque()
         index = self._next_index(time.monotonic_ns() + _FIRST_PICTURE_NS)
         cost_ns = 0
-        while not target.gone:
+        reading = True
+        while reading:
             begin_ns = time.monotonic_ns()
             if waiting and (len(waiting) >= ahead or waiting[0][0] - begin_ns < 1.5 * cost_ns):
-                due_ns, packet = waiting.popleft()
+                due_ns, data = waiting.popleft()
                 self.pacer.wait_until(due_ns)
-                encoder.send(packet)
+                reading = send_all(client, data)
                 self.pacer.done(due_ns)
                 continue
             if self._host_ns(index) < begin_ns - _BEHIND_NS:
                 now_index = self._next_index(begin_ns)
                 self._skipped += now_index - index
                 index = now_index
-            waiting.append(self._picture(encoder, index))
+            due_ns, packet = self._picture(encoder, index)
+            encoder.write(packet)
+            waiting.append((due_ns, stream.take()))
             index += 1
             cost_ns = max(time.monotonic_ns() - begin_ns, int(0.9 * cost_ns))
-        with suppress(av.FFmpegError):
-            encoder.close()
+        encoder.close()
 
     def _picture(self, encoder: PictureEncoder, index: int) -> tuple[int, Packet[VideoStream]]:
         """When the picture of that number is due, and its packet."""

@@ -6,16 +6,12 @@ import av
 import numpy as np
 import pytest
 
-from simulated_devices.camera import ClientStream, PictureEncoder
+from simulated_devices.camera import ClientStream, PictureEncoder, send_all
 from simulated_devices.scene import CameraRenderer, Room, stereo_pair
 from simulated_devices.world import Trajectory
 
 FIRST_US = 123_456_789_012
 FPS = 10
-
-
-class Tape(io.BytesIO):
-    gone = False
 
 
 def nal_types(packet):
@@ -32,11 +28,11 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def stream(pictures):
-    tape = Tape()
-    encoder = PictureEncoder(tape, 320, 200, FPS)
+    target = ClientStream()
+    encoder = PictureEncoder(target, 320, 200, FPS)
     for index, picture in enumerate(pictures):
-        encoder.send(encoder.encode(picture, FIRST_US + index * 100_000))
-    return tape.getvalue()  # not closed: what a client has had by now
+        encoder.write(encoder.encode(picture, FIRST_US + index * 100_000))
+    return target.take()  # not closed: what a client has had by now
 
 
 def test_each_packet_is_one_picture_with_its_exact_time(stream, pictures):
@@ -65,22 +61,29 @@ def test_the_luma_plane_is_the_picture(stream, pictures):
         assert abs(got.mean() - picture.mean()) < 0.5
 
 
+def test_a_picture_is_whole_as_soon_as_it_is_written(pictures):
+    target = ClientStream()
+    encoder = PictureEncoder(target, 320, 200, FPS)
+    data = b""
+    for index, picture in enumerate(pictures[:3]):
+        encoder.write(encoder.encode(picture, FIRST_US + index * 100_000))
+        data += target.take()
+        with av.open(io.BytesIO(data)) as container:
+            assert len(list(container.decode(video=0))) == index + 1
+    encoder.close()
+
+
 def test_a_client_that_left_is_noticed():
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        target = ClientStream(ours)
-        assert target.write(b"picture") == 7
+        assert send_all(ours, b"picture")
         assert theirs.recv(100) == b"picture"
         theirs.close()
-        assert target.write(b"picture") == 7
-        assert target.gone
-        assert target.write(b"picture") == 7
+        assert not send_all(ours, b"picture")
 
 
 def test_a_client_that_does_not_read_is_given_up():
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.settimeout(0.01)
-        target = ClientStream(ours)
-        target.write(bytes(10_000_000))
-        assert target.gone
+        assert not send_all(ours, bytes(10_000_000))
