@@ -232,6 +232,20 @@ class NoisyImu:
         return gyro_rad_s + errors[:, :3], accel_m_s2 + errors[:, 3:]
 
 
+class NoisyMagnetometer:
+    """A magnetometer on a trajectory, read sample by sample, with white noise of `sigma_ut` per axis."""
+
+    def __init__(self, trajectory: Trajectory, seed: int, sigma_ut: float = 0.05) -> None:
+        self._trajectory = trajectory
+        self._generator = np.random.default_rng(seed)
+        self._sigma_ut = sigma_ut
+
+    def read(self, t_s: FloatArray) -> FloatArray:
+        """Return the field (n, 3) in the sensor frame, µT, of the next n samples, taken at times (n,)."""
+        field_ut = magnetometer_ut(self._trajectory.kinematics(t_s))
+        return field_ut + self._generator.normal(0.0, self._sigma_ut, field_ut.shape)
+
+
 WGS84_A_M = 6378137.0
 WGS84_E2 = (2.0 - 1.0 / 298.257223563) / 298.257223563
 

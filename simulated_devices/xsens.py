@@ -26,7 +26,7 @@ from simulated_devices.timing import (
     Stage,
     UartTransmitter,
 )
-from simulated_devices.world import FloatArray, ImuNoise, NoisyImu, Trajectory, magnetometer_ut
+from simulated_devices.world import FloatArray, ImuNoise, NoisyImu, NoisyMagnetometer, Trajectory
 
 PREAMBLE = 0xFA
 BUS_ID = 0xFF
@@ -259,6 +259,7 @@ class XsensSimulator:
         self._uart = UartTransmitter(settings.baud)
         self._device = XbusDevice(0x03700000 | stage.seed_for("serial number", name) & 0xFFFF, settings.rate_hz)
         self._imu = NoisyImu(trajectory, ImuNoise(), BASE_RATE_HZ, stage.seed_for("imu", name))
+        self._magnetometer = NoisyMagnetometer(trajectory, stage.seed_for("magnetometer", name))
         self._rate_hz = settings.rate_hz
         self._next_sample = 0
         self._measuring_since_ns = 0
@@ -306,7 +307,7 @@ class XsensSimulator:
 
     def _read(self, numbers: np.typing.NDArray[np.int64], world_s: FloatArray) -> list[Reading]:
         gyro_rad_s, accel_m_s2 = self._imu.read(world_s)
-        mag_ut = magnetometer_ut(self._trajectory.kinematics(world_s))
+        mag_ut = self._magnetometer.read(world_s)
         ticks = (numbers * (_SAMPLE_NS // TICK_NS)).tolist()
         warm_s = (time.monotonic_ns() - self._stage.epoch_ns) * 1e-9
         celsius = 36.0 - 6.0 * math.exp(-warm_s / 300.0)
