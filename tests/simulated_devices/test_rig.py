@@ -191,7 +191,7 @@ def test_poses_come_at_their_rate_on_the_clock_of_the_imu(simulator):
 
 def test_the_rig_moves_a_second_after_its_devices_were_opened(scratch_rig):
     path = scratch_rig(gnss={"driver": "nmea"}, mocap={"driver": "pose", "port": 0, "rate_hz": 50})
-    simulator = Simulator(path)
+    simulator = Simulator(path, "--report")
     with udp(simulator.devices["mocap"]["port"]) as receiver:
         first = json.loads(receiver.recv(2048))
         for _ in range(10):
@@ -202,7 +202,10 @@ def test_the_rig_moves_a_second_after_its_devices_were_opened(scratch_rig):
             assert time.monotonic() < opened_s + DEADLINE_S
         assert time.monotonic() - opened_s > 1.9
         os.close(descriptor)
-    assert simulator.end() == (0, "")
+    code, report = simulator.end()
+    assert code == 0
+    assert sorted(line.split(":")[0] for line in report.splitlines()) == ["gnss", "mocap"]
+    assert report.count(" sent, late by ") == 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
