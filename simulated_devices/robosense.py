@@ -23,6 +23,7 @@ FRAME_NS = SECOND_NS // 10
 PACKET_NS = round(FRAME_NS / M1_PACKETS)
 MSOP_MAGIC = np.frombuffer(bytes.fromhex("55AA5AA5"), dtype=np.uint8)
 DIFOP_MAGIC = np.frombuffer(bytes.fromhex("A5FF005A11115555"), dtype=np.uint8)
+PROTOCOL_VERSION = 0x0100
 STRONGEST_RETURN = 4
 INTERNAL_CLOCK = 0
 LIDAR_TYPE = 0x10
@@ -107,6 +108,7 @@ class MsopEncoder:
         packets = np.zeros(M1_PACKETS, dtype=MSOP)
         packets["magic"] = MSOP_MAGIC
         packets["sequence"] = np.arange(1, M1_PACKETS + 1)
+        packets["protocol_version"] = PROTOCOL_VERSION
         packets["return_mode"] = STRONGEST_RETURN
         packets["sync_mode"] = INTERNAL_CLOCK
         packets["lidar_type"] = LIDAR_TYPE

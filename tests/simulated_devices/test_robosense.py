@@ -34,6 +34,7 @@ def test_a_packet_of_points():
     expected = bytearray(1210)
     expected[0:4] = bytes.fromhex("55 AA 5A A5")
     expected[4:6] = bytes.fromhex("00 07")  # counted from 1
+    expected[6:8] = bytes.fromhex("01 00")
     expected[8] = 4  # strongest return
     expected[9] = 0  # own clock
     expected[10:16] = bytes.fromhex("00 01 23 45 67 89")
