@@ -279,6 +279,8 @@ class ClockMap:
     tick_hz, wrap_bits: of the first stream; 0 bits: the counter does not wrap.
     prior_skew_ppm, prior_sigma_ppm: what is known of the device clock's rate error beforehand.
     inline_refit: if False, the owner calls `refit`, say in a worker, whenever `refit_due`.
+    use_grid: look for the polling grid of the link and use it; level: how stamps are then placed above the unknown
+    floor, "lowest" by the least delayed arrival, "model" by the fitted law of the delay.
     """
 
     def __init__(
@@ -290,9 +292,10 @@ class ClockMap:
         prior_sigma_ppm: float = 100.0,
         inline_refit: bool = True,
         level: Literal["lowest", "model"] = "lowest",
+        use_grid: bool = True,
     ):
         prior = SlopePrior(1 / (1 + prior_skew_ppm * PPM) - 1, max(prior_sigma_ppm, 1e-3) * PPM)
-        self._estimator = Estimator(prior, inline_refit, level)
+        self._estimator = Estimator(prior, inline_refit, level, use_grid)
         self._stream = ClockStream(self._estimator, tick_hz, wrap_bits)
         self.map = self._stream.map
 

@@ -116,9 +116,9 @@ class Estimator:
     Calls must not overlap, but `refit` may run in another thread than the rest.
     """
 
-    def __init__(self, prior: SlopePrior, inline_refit: bool, level: str = "lowest"):
+    def __init__(self, prior: SlopePrior, inline_refit: bool, level: str = "lowest", use_grid: bool = True):
         self.level = level
-        self.grid = PollingGrid()
+        self.grid = PollingGrid() if use_grid else None
         self.grid_line: GridLine | None = None
         self.inline_refit = inline_refit
         self.refit_due = False
@@ -193,7 +193,8 @@ class Estimator:
         self.early_ns = float(LATE_NS)
         self.last_x = x
         self.refit_due = False
-        self.grid.restart()
+        if self.grid is not None:
+            self.grid.restart()
         self._prior = prior
         self._begin_x = x
         self._next_refit_x = x
@@ -262,7 +263,8 @@ class Estimator:
         x, y = self._open_points()
         bucket = summarise(x, y, self.fit.slope)
         self._buckets.append(bucket)
-        self.grid.feed(x, y, self.fit.slope)
+        if self.grid is not None:
+            self.grid.feed(x, y, self.fit.slope)
         self._open_x, self._open_y = [], []
         self._open_end = last + self._pace_ns(BUCKET_S[1])
         while last - self._buckets[0].last_x > WINDOW_S * S:
@@ -298,7 +300,7 @@ class Estimator:
         epoch, buckets, prior = self.epoch, self._buckets[:], self._prior
         if buckets:
             line = blend(buckets, prior)
-            self.grid_line = self.grid.fit(line, prior)
+            self.grid_line = self.grid.fit(line, prior) if self.grid is not None else None
             if self.grid_line is not None:
                 line = combine(line, self.grid_line, buckets, self.level, self.last_x)
             self._ready = (epoch, line)

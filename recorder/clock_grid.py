@@ -235,6 +235,16 @@ class GridTracker:
         self._covariance = np.zeros((2, 2))  # of edge (ns) and frequency
         self._lost = 0
 
+    def rewound(self, arrival: Floats) -> GridTracker:
+        """A tracker that knows the period and frequency already and begins at the first of these arrivals."""
+        other = GridTracker()
+        other.period_ns, other._frequency = self.period_ns, self._frequency  # noqa: SLF001
+        period = self.period_ns * (1 + self._frequency)
+        phase = float(np.angle(np.exp(2j * np.pi * ((arrival % period) / period)).mean())) / (2 * np.pi) * period
+        other._edge = phase + math.floor((arrival[0] - phase) / period) * period  # noqa: SLF001
+        other._covariance = np.diag([(0.1 * period) ** 2, (1e-6) ** 2])  # noqa: SLF001
+        return other
+
     def feed(self, arrival: Floats) -> tuple[Floats, NDArray[np.bool_], Ints, float] | None:
         """Follow ascending arrivals: their polls, whether they lie on them, the polls' indices, the jitter."""
         if not self.period_ns:

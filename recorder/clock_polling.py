@@ -131,7 +131,7 @@ class PollingGrid:
         jitter = float(np.median([p.jitter_ns for p in points]))
         trust, sd = self._trust(problem, fitted, covariance, kept, t, jitter)
         residues = np.sum([p.residues for p in points], axis=0)
-        if _on_coarser_grid(residues):
+        if on_coarser_grid(residues):
             trust = 0.0
         return GridLine(
             end,
@@ -158,7 +158,7 @@ class PollingGrid:
             weights = np.array([height - line.at(end), (slope - line.slope) * S, last.curvature * S**2])
             if float((problem.height - problem.basis @ weights).min()) > -FAR_OFF * problem.period:
                 starts.append((weights, last.law))
-                problem.count = _without_late(problem, everything, weights, last.law, bucket)
+                problem.count = without_late(problem, everything, weights, last.law, bucket)
         self._fits += 1
         if not starts or span_s < YOUNG_S or self._fits % 8 == 0:
             mean = float(problem.count @ problem.height / problem.count.sum()) - low
@@ -167,7 +167,7 @@ class PollingGrid:
         best = max((problem.climb(*start) for start in starts), key=lambda fit: fit.value)
         if not math.isfinite(best.value):
             return None
-        kept = _without_late(problem, everything, best.weights, best.law, bucket)
+        kept = without_late(problem, everything, best.weights, best.law, bucket)
         if (kept != problem.count).any():
             problem.count = kept
             best = problem.climb(best.weights, best.law)
@@ -185,23 +185,12 @@ class PollingGrid:
         self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats, jitter: float
     ) -> tuple[float, tuple[float, float]]:
         """How far to believe the fit, and one sigma of its height and slope at the newest end."""
-        distance = problem.height - problem.basis @ fitted.weights
-        law = DelayLaw.of(fitted.law)
         sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance))
         sd_slope = math.sqrt(max(covariance[1, 1], 0.0))
-        low, high = _weighted_quantiles(distance, kept, (0.1, 0.9))
-        if high - low < WIDE * jitter:
-            return 0.0, (sd, sd_slope)
-        upper, _ = law.cdf(distance)
-        lower, _ = law.cdf(distance - problem.period)
-        kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
-        misfit = _misfit(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
-        self._load = max(0.85 * self._load, _load_dependence(lower, upper, kept, t))
+        fitness = judge(problem, fitted, kept, t, jitter)
+        self._load = max(0.85 * self._load, fitness.load)
         share = float(kept.sum()) / max(float(sum(p.count.sum() for p in self.points)), 1.0)
-        self.misfit = misfit
-        trust = _ramp(misfit, 0.025, 0.045) * _ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
-        if problem.period > COARSE_NS:
-            trust *= _ramp(law.mean_ns / problem.period, 0.25, 0.1)
+        trust = fitness.trust * ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
         return trust / (1 + (sd / (0.4 * problem.period)) ** 2), (sd, sd_slope)
 
     def _flatness(self, problem: IntervalFit, fitted: Fitted, covariance: Floats) -> float:
@@ -216,23 +205,48 @@ class PollingGrid:
         return sigma
 
 
-def _without_late(problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints) -> Floats:
+@dataclass(frozen=True, slots=True)
+class Fitness:
+    """How well the fitted law describes what was seen: trust without the load's part, and how far the load shows."""
+
+    trust: float
+    load: float
+
+
+def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats, jitter_ns: float) -> Fitness:
+    """Test a fit: do the delays spread over polls at all, do they follow the law, and the same one throughout?"""
+    distance = problem.height - problem.basis @ fitted.weights
+    law = DelayLaw.of(fitted.law)
+    low, high = weighted_quantiles(distance, kept, (0.1, 0.9))
+    if high - low < WIDE * jitter_ns:
+        return Fitness(0.0, 0.0)
+    upper, _ = law.cdf(distance)
+    lower, _ = law.cdf(distance - problem.period)
+    kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
+    misfit = misfit_of(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
+    trust = ramp(misfit, 0.025, 0.045)
+    if problem.period > COARSE_NS:
+        trust *= ramp(law.mean_ns / problem.period, 0.25, 0.1)
+    return Fitness(trust, load_dependence(lower, upper, kept, t))
+
+
+def without_late(problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints) -> Floats:
     """Counts with the buckets zeroed whose delays are of another kind, unless these are the most."""
     good = problem.bucket_test(law, weights, bucket, count)[bucket]
     return np.where(good, count, 0.0) if count[good].sum() > MIN_KEPT * count.sum() else count
 
 
-def _ramp(value: float, good: float, bad: float) -> float:
+def ramp(value: float, good: float, bad: float) -> float:
     return min(max((bad - value) / (bad - good), 0.0), 1.0)
 
 
-def _weighted_quantiles(values: Floats, weight: Floats, shares: tuple[float, ...]) -> list[float]:
+def weighted_quantiles(values: Floats, weight: Floats, shares: tuple[float, ...]) -> list[float]:
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return [float(values[order][min(np.searchsorted(total, q * total[-1]), values.size - 1)]) for q in shares]
 
 
-def _misfit(lower: Floats, upper: Floats, count: Floats, phase: Floats) -> float:
+def misfit_of(lower: Floats, upper: Floats, count: Floats, phase: Floats) -> float:
     """Distance of the probability integral transforms from uniform, by quarter of the phase.
 
     For interval data each sample's transform is spread over its interval (Czado, Gneiting, Held, "Predictive model
@@ -252,7 +266,7 @@ def _misfit(lower: Floats, upper: Floats, count: Floats, phase: Floats) -> float
     return float(np.mean(distances)) if distances else 0.0
 
 
-def _load_dependence(lower: Floats, upper: Floats, count: Floats, t: Floats) -> float:
+def load_dependence(lower: Floats, upper: Floats, count: Floats, t: Floats) -> float:
     """How much blocks of seconds differ in their mean transform beyond chance; the worst sixth left out."""
     block = np.floor((t - t.min()) / BLOCK_S).astype(np.int64)
     total = np.bincount(block, count)
@@ -264,7 +278,7 @@ def _load_dependence(lower: Floats, upper: Floats, count: Floats, t: Floats) -> 
     return math.sqrt(max(float(excess.mean()), 0.0)) if excess.size > 2 else 0.0
 
 
-def _on_coarser_grid(residues: Ints) -> bool:
+def on_coarser_grid(residues: Ints) -> bool:
     """All polls that brought something share a residue: the true period is a multiple of the one found."""
     total = residues.sum()
     for factor in (2, 3, 5):

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock_fit import Floats, hull_slope
+from recorder.clock_grid import LAW_PRIOR, Fitted, GridPoints, GridTracker, IntervalFit, snap
+from recorder.clock_polling import judge, on_coarser_grid, ramp, without_late
 
 Ints = NDArray[np.int64]
 
@@ -21,6 +23,12 @@ BIN_S = 0.25
 KNOT_S = (150.0, 75.0, 37.5)
 MIN_SPAN_S = 1.0  # the slope of a shorter epoch is taken as nominal
 CLEAR = 0.15  # of the spread: a third of a piece further than this above the curve asks for more knots
+GRID_KNOT_S = 20.0
+GRID_CURVATURE = 0.02e-6 / S
+GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
+ROUNDS = 4
+CHUNK_ARRIVALS = 40
+FREE = 1e-20
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
 
 
@@ -116,8 +124,8 @@ def stays_clear(curve: Curve, x: Floats, y: Floats, limit_ns: float) -> bool:
     return False
 
 
-def refine_epoch(x: Floats, y: Floats) -> Curve:
-    """The curve of one sync epoch from its samples in ascending order."""
+def envelope_by_data(x: Floats, y: Floats) -> Curve:
+    """The envelope of one sync epoch with as many knots as the data ask for."""
     slope = hull_slope(*lowest_points(x, y, 0.0))[0] if x[-1] - x[0] > MIN_SPAN_S * S else 0.0
     low_x, low_y = lowest_points(x, y, slope)
     if low_x.size < 4:
@@ -130,3 +138,67 @@ def refine_epoch(x: Floats, y: Floats) -> Curve:
         curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], spacing_s))
         limit_ns = CLEAR * float(np.median(y - curve.at(x)))
     return curve
+
+
+def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], float]:
+    """All samples on the polls of the link, by seconds, and the period; nothing without a grid."""
+    arrival = np.sort(x + y)
+    tracker = GridTracker()
+    cuts = np.searchsorted(arrival, np.arange(arrival[0] + S, arrival[-1], S))
+    for part in np.split(arrival, cuts):
+        if part.size:
+            tracker.feed(part)
+    if not tracker.period_ns:
+        return [], 0.0
+    tracker = tracker.rewound(arrival[:CHUNK_ARRIVALS])
+    cuts = np.searchsorted(x, np.arange(x[0] + S, x[-1], S))
+    parts = zip(np.split(x, cuts), np.split(y, cuts), strict=True)
+    points = [snap(part_x, part_y, slope, tracker) for part_x, part_y in parts if part_x.size]
+    return [p for p in points if p is not None], tracker.period_ns
+
+
+def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | None:
+    """The offset by the likelihood of the polls (`recorder.clock_grid`) near the envelope, and how far to trust it."""
+    slope = float((beneath.heights[-1] - beneath.heights[0]) / (beneath.knots_x[-1] - beneath.knots_x[0]))
+    points, period = grid_points(x, y, slope)
+    if not points or x[-1] - x[0] < 2 * MIN_SPAN_S * S:
+        return None
+    at_x, at_y, count = (np.concatenate([getattr(p, name) for p in points]) for name in ("x", "y", "count"))
+    bucket = np.repeat(np.arange(len(points)), [p.x.size for p in points])
+    knots_x = knots(float(at_x.min()), float(at_x.max()), GRID_KNOT_S)
+    basis = hat_basis(at_x, knots_x)
+    precision = bending(knots_x, GRID_CURVATURE) + FREE * np.eye(knots_x.size)
+    height = at_y - beneath.at(at_x)
+    level = beneath.at(knots_x)
+    problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
+    low = float(height.min())
+    mean = max(float(count @ height / count.sum()) - low, 0.1 * period)
+    law = LAW_PRIOR + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
+    fits = [problem.climb(np.full(knots_x.size, low - share * period), law, 12) for share in GRID_STARTS]
+    best = max(fits, key=lambda fit: fit.value)
+    for _ in range(ROUNDS):
+        kept = without_late(problem, count, best.weights, best.law, bucket)
+        if (kept == problem.count).all():
+            break
+        problem.count = kept
+        best = problem.climb(best.weights, best.law, 12)
+    return Curve(knots_x, level + best.weights), _trust(problem, best, at_x, points)
+
+
+def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
+    jitter_ns = float(np.median([p.jitter_ns for p in points]))
+    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S, jitter_ns)
+    if on_coarser_grid(np.sum([p.residues for p in points], axis=0)):
+        return 0.0
+    return fitness.trust * ramp(fitness.load, 0.02, 0.04)
+
+
+def refine_epoch(x: Floats, y: Floats) -> Curve:
+    """The curve of one sync epoch from its samples in ascending order."""
+    beneath = envelope_by_data(x, y)
+    found = grid_curve(x, y, beneath)
+    if found is None or found[1] == 0.0:
+        return beneath
+    curve, trust = found
+    knots_x = np.union1d(curve.knots_x, beneath.knots_x)
+    return Curve(knots_x, trust * curve.at(knots_x) + (1 - trust) * beneath.at(knots_x))

@@ -19,14 +19,14 @@ from drivers.samples import POINT_DTYPE, FixSample, FrameSample, ImuSample, Pose
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.recording.manifest import DeviceSummary, StreamSummary
 from recorder.recording.writer import RecordingWriter, new_manifest
-from simulated_devices.camera import ClientStream, PictureEncoder
+from simulated_devices.camera import PictureEncoder
 from simulated_devices.nmea import ORIGIN, SIGMA_M
 from simulated_devices.pose import quaternion
 from simulated_devices.rig import Cast, calibration, simulate_settings
 from simulated_devices.robosense import IMU_FROM_LIDAR
 from simulated_devices.scene import CameraRenderer, M1Scanner, PinholeCamera
 from simulated_devices.timing import SECOND_NS, random_for
-from simulated_devices.world import ImuNoise, NoisyImu, magnetometer_ut
+from simulated_devices.world import ImuNoise, NoisyImu, NoisyMagnetometer
 
 WORLD_BEFORE_START_S = 1.0  # a take begins about so long before the world does
 TWIN_UTC_NS = 1_767_225_600 * SECOND_NS  # a date, so that the same seed gives the same files
@@ -37,16 +37,6 @@ BATCH = 100
 PROGRESS_NS = 5 * SECOND_NS
 
 Item = tuple[int, int, str, Any]  # time, order of adding, device, sample
-
-
-class _NoClient(ClientStream):
-    """Swallows the container: only the packets are wanted."""
-
-    def __init__(self) -> None:
-        self.gone = False
-
-    def write(self, data: bytes) -> int:
-        return len(data)
 
 
 class Twin:
@@ -90,10 +80,12 @@ class Twin:
         rate_hz = self._rate_hz(name, "rate_hz", 400)
         stage, trajectory = self._cast.stage, self._cast.trajectory
         imu = NoisyImu(trajectory, ImuNoise(), rate_hz, stage.seed_for("imu", name))
+        magnetometer = NoisyMagnetometer(trajectory, stage.seed_for("magnetometer", name))
+        magnetometer = NoisyMagnetometer(trajectory, stage.seed_for("magnetometer", name))
         for times_ns in self._times(rate_hz, 0):
             world_s = _world_s(times_ns)
             gyro, accel = imu.read(world_s)
-            field_ut = magnetometer_ut(trajectory.kinematics(world_s))
+            field_ut = magnetometer.read(world_s)
             for index, time_ns in enumerate(times_ns.tolist()):
                 accel_m_s2, gyro_rad_s, mag_ut = (tuple(values[index].tolist()) for values in (accel, gyro, field_ut))
                 yield time_ns, order, name, ImuSample(None, time_ns, accel_m_s2, gyro_rad_s, mag_ut)
@@ -121,13 +113,13 @@ class Twin:
         camera: PinholeCamera = self._cast.cameras[self.cameras.index(name)]
         fps = self._rate_hz(name, "fps", 20)
         renderer = CameraRenderer(self._cast.room, camera, seed=self._cast.stage.seed_for("camera", name))
-        encoder = PictureEncoder(_NoClient(), camera.width, camera.height, fps)
+        encoder = PictureEncoder(camera.width, camera.height, fps)
         video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p", b"")
         for times_ns in self._times(fps, FRAMES_AFTER_IMU_NS):
             rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             for index, time_ns in enumerate(times_ns.tolist()):
                 picture = renderer.render(rotation[index], position_m[index])
-                packet = encoder.encode(picture, time_ns // 1000)
+                packet = encoder.packet(picture, time_ns // 1000)
                 exposure_s = self.entries[name].get("exposure_s")
                 sample = FrameSample(time_ns, bytes(packet), bool(packet.is_keyframe), video, exposure_s)
                 yield time_ns, order, name, sample
