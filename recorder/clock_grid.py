@@ -39,8 +39,8 @@ RESIDUES = 30
 
 SHAPES = np.geomspace(0.5, 10.0, 73)  # of the gamma law
 UNITS = np.linspace(0.0, 7.0, 280) ** 2  # delays in units of the law's scale
-LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log ratio of the tail's mean
-LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(5.0)])
+LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log of (ratio of the tail's mean - 2)
+LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(3.0)])
 LAW_SIGMA = np.array([0.5, 50.0, 1.5, 0.7])
 OUTLIERS = 2e-4
 SOFT_EDGE = 0.02  # of the period: how fast "earlier than possible" becomes impossible
@@ -88,7 +88,7 @@ class DelayLaw:
     def of(cls, law: Floats) -> DelayLaw:
         """From the four unbounded parameters."""
         shape = math.exp(min(max(law[0], math.log(0.8)), math.log(8.0)))
-        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), math.exp(law[3]))
+        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), 2 + math.exp(law[3]))
 
     @property
     def mean_ns(self) -> float:
@@ -113,8 +113,9 @@ class DelayLaw:
         tail_density = decay / mean * (delay > 0)
         density = (1 - w) * body_density + w * tail_density
         by_tail = -w * delay * tail_density
+        by_ratio = by_tail * (1 - 2 / self.ratio)
         by_weight = (1 - decay - body) * w * (1 - 2 * w)
-        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_tail], axis=1)
+        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_ratio], axis=1)
         return (1 - w) * body + w * (1 - decay), slopes
 
     def seen(self, distance: Floats, period: float) -> tuple[Floats, Floats]:
@@ -171,7 +172,7 @@ class IntervalFit:
         """Damped Fisher scoring from a start."""
         p = weights.size
         value, gradient, information = self.objective(weights, law)
-        damping = 1e-3
+        damping = 1e-5
         for _ in range(steps):
             matrix = information + damping * np.diag(np.diag(information))
             step = np.linalg.solve(matrix, gradient)
@@ -181,7 +182,7 @@ class IntervalFit:
             if trial[0] > value:
                 gain = trial[0] - value
                 weights, law, (value, gradient, information) = trial_weights, trial_law, trial
-                damping = max(damping / 5, 1e-6)
+                damping = max(damping / 10, 1e-10)
                 if gain < 1e-2:
                     break
             else:

@@ -15,6 +15,7 @@ import numpy as np
 
 from recorder.clock_fit import Floats, Line, SlopePrior
 from recorder.clock_grid import (
+    LAW_PRIOR,
     RESIDUES,
     DelayLaw,
     Fitted,
@@ -32,8 +33,8 @@ YOUNG_S = 20.0
 CURVATURE = (1.0, 10.0, 40.0)  # one sigma of the curvature, ns/s^2: least, at first, most
 FREE = 1e12
 STARTS = (0.05, 0.3, 0.6)  # of the period below the lowest point
-FIRST_LAW = np.array([math.log(1.5), 0.0, -3.0, math.log(5.0)])
 MIN_KEPT = 0.35
+HIGH_RANK, HIGH_SIGMA = 0.12, 4.0
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
@@ -161,8 +162,8 @@ class PollingGrid:
                 problem.count = without_late(problem, everything, weights, last.law, bucket)
         self._fits += 1
         if not starts or span_s < YOUNG_S or self._fits % 8 == 0:
-            mean = float(problem.count @ problem.height / problem.count.sum()) - low
-            law = FIRST_LAW + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
+            mean = float(problem.count @ problem.height / problem.count.sum()) - low - 0.5 * problem.period
+            law = LAW_PRIOR + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
             starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in STARTS]
         best = max((problem.climb(*start) for start in starts), key=lambda fit: fit.value)
         if not math.isfinite(best.value):
@@ -230,10 +231,22 @@ def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats, jitter_
     return Fitness(trust, load_dependence(lower, upper, kept, t))
 
 
-def without_late(problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints) -> Floats:
-    """Counts with the buckets zeroed whose delays are of another kind, unless these are the most."""
-    good = problem.bucket_test(law, weights, bucket, count)[bucket]
-    return np.where(good, count, 0.0) if count[good].sum() > MIN_KEPT * count.sum() else count
+def without_late(
+    problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints, *, by_rank: bool = False
+) -> Floats:
+    """Counts with the buckets zeroed whose delays are of another kind, unless these are the most.
+
+    by_rank: also those that rank high in the law throughout, for a law that was fitted to them, too.
+    """
+    good = problem.bucket_test(law, weights, bucket, count)
+    if by_rank:
+        distance = problem.height - problem.basis @ weights
+        kind = DelayLaw.of(law)
+        rank = 0.5 * (kind.cdf(distance)[0] + kind.cdf(distance - problem.period)[0]) - 0.5
+        total = np.maximum(np.bincount(bucket, count), 1.0)
+        good &= np.bincount(bucket, count * rank) / total < np.maximum(HIGH_RANK, HIGH_SIGMA * 0.29 / np.sqrt(total))
+    kept = good[bucket]
+    return np.where(kept, count, 0.0) if count[kept].sum() > MIN_KEPT * count.sum() else count
 
 
 def ramp(value: float, good: float, bad: float) -> float:

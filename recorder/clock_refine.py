@@ -27,6 +27,7 @@ GRID_KNOT_S = 20.0
 GRID_CURVATURE = 0.02e-6 / S
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
 ROUNDS = 4
+FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
@@ -172,16 +173,17 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | No
     level = beneath.at(knots_x)
     problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
     low = float(height.min())
-    mean = max(float(count @ height / count.sum()) - low, 0.1 * period)
+    mean = max(float(count @ height / count.sum()) - low - 0.5 * period, 0.1 * period)
     law = LAW_PRIOR + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
-    fits = [problem.climb(np.full(knots_x.size, low - share * period), law, 12) for share in GRID_STARTS]
+    fits = [problem.climb(np.full(knots_x.size, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
     best = max(fits, key=lambda fit: fit.value)
+    best = problem.climb(best.weights, best.law, MANY_STEPS)
     for _ in range(ROUNDS):
-        kept = without_late(problem, count, best.weights, best.law, bucket)
+        kept = without_late(problem, count, best.weights, best.law, bucket, by_rank=True)
         if (kept == problem.count).all():
             break
         problem.count = kept
-        best = problem.climb(best.weights, best.law, 12)
+        best = problem.climb(best.weights, best.law, MANY_STEPS)
     return Curve(knots_x, level + best.weights), _trust(problem, best, at_x, points)
 
 
