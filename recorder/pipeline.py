@@ -73,8 +73,7 @@ class Pipeline:
             summary.dropped += 1
         elif not isinstance(sample, ClockPairs):
             summary.received += 1
-        for stamped in self._timebase.take(device, arrival_ns, sample):
-            self._place(stamped)
+        self._timebase.take(device, arrival_ns, sample)
 
     def _place(self, stamped: Stamped) -> None:
         device = self._devices[stamped.device]

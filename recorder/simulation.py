@@ -38,7 +38,7 @@ class SimulatedRig:
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         assert self._process.stdout is not None
-        lines = []
+        lines: list[str] = []
         for line in self._process.stdout:
             if line.rstrip() == END_OF_YAML:
                 self.yaml = "".join(lines)
