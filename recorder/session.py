@@ -265,8 +265,9 @@ class Take:
                 drop_began = False
                 continue
             kept, lost = _without_payload(item)
-            self._devices[name].summary.dropped += lost
-            if not drop_began:
+            if drop_began:
+                self._devices[name].summary.dropped += lost
+            else:  # the event counts them
                 self._note(name, DeviceEvent("drop", "the recorder is too slow: samples are dropped", lost))
             drop_began = True
             self._inbox.offer((name, kept), 0)
