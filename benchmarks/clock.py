@@ -105,7 +105,9 @@ def make(link: Link, seed: int, scale: float = 1.0) -> Trace:
         breaks_ns.append(BOOT_NS + int(duration_s / 2 * 1e9))
     times = np.where(rng.random(true_s.size) < link.lost, 0, 1) + (rng.random(true_s.size) < link.doubled)
     to_ns = lambda s: np.repeat(np.round(s * 1e9).astype(np.int64), times) + BOOT_NS  # noqa: E731
-    return Trace(to_ns(true_s), np.repeat(ticks, times), np.maximum.accumulate(to_ns(arrival_s)), breaks_ns, link.tick_hz)
+    return Trace(
+        to_ns(true_s), np.repeat(ticks, times), np.maximum.accumulate(to_ns(arrival_s)), breaks_ns, link.tick_hz
+    )
 
 
 USB = gamma(2.0, 350 * US)
@@ -140,8 +142,12 @@ LINKS: dict[str, Link] = {
     "law_weibull": Link(lambda rng, n: 800 * US * rng.weibull(1.5, n), poll_s=MS),
     "law_uniform": Link(lambda rng, n: rng.uniform(0, 1.5 * MS, n), poll_s=MS),
     "law_constant": Link(lambda rng, n: np.zeros(n), poll_s=MS),
-    "law_fast_path": Link(mixture(0.05, lambda rng, n: np.zeros(n), lambda rng, n: 300 * US + rng.gamma(2, 350 * US, n)), poll_s=MS),
-    "law_bimodal": Link(mixture(0.5, gamma(2.0, 50 * US), lambda rng, n: 1.6 * MS + rng.gamma(2, 50 * US, n)), poll_s=MS),
+    "law_fast_path": Link(
+        mixture(0.05, lambda rng, n: np.zeros(n), lambda rng, n: 300 * US + rng.gamma(2, 350 * US, n)), poll_s=MS
+    ),
+    "law_bimodal": Link(
+        mixture(0.5, gamma(2.0, 50 * US), lambda rng, n: 1.6 * MS + rng.gamma(2, 50 * US, n)), poll_s=MS
+    ),
     "law_load_wave": Link(USB, poll_s=MS, load=lambda t: 1 + 0.6 * np.sin(2 * np.pi * t / 23)),
     "law_load_steps": Link(USB, poll_s=MS, load=loadsteps),
     "law_rare_10ms": Link(mixture(0.9, USB, lambda rng, n: 10 * MS + rng.gamma(2, 350 * US, n)), poll_s=MS),

@@ -26,7 +26,7 @@ BUCKET_S = (0.05, 1.0, 5.0)  # shortest, usual, longest when samples are few
 BUCKET_SHARE = 0.1  # of the epoch's age while it is young
 BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
-IGNORE_TRUST, MIN_TRUST = 0.01, 0.5
+IGNORE_TRUST, MIN_TRUST = 0.3, 0.5
 GRID_LEVEL = 0.02  # of the mean delay: what the place by the delay law may be wrong by
 GRID_LEVEL_S = 120  # the grid's curve is put on the lowest point of this last time
 REFIT_S = 2.0
@@ -299,7 +299,7 @@ class Estimator:
         self.refit_due = False
         epoch, buckets, prior = self.epoch, self._buckets[:], self._prior
         if buckets:
-            line = blend(buckets, prior)
+            line = blend(buckets, prior, self.grid.period_ns if self.grid is not None else 0.0)
             self.grid_line = self.grid.fit(line, prior) if self.grid is not None else None
             if self.grid_line is not None:
                 line = combine(line, self.grid_line, buckets, self.level, self.last_x)

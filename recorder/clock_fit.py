@@ -154,27 +154,28 @@ def mean_slope(x: Floats, y: Floats, sd: Floats) -> tuple[float, float]:
     return slope, sigma * math.sqrt(x.size / min(x.size, 2 * runs))
 
 
-def blend(buckets: list[Bucket], prior: SlopePrior) -> Line:
+def blend(buckets: list[Bucket], prior: SlopePrior, period_ns: float = 0.0) -> Line:
     """Best line under the buckets: prior, means and hull edge weighed by their variances, level by the lowest.
 
     The means dither a polled link's quantisation away but follow the load; the hull edge does the opposite.
+    period_ns: of the link's polls, if they are known.
     """
     table = np.array(buckets, dtype=np.float64)
     pivot = float(table[-1, 6])
     while True:
-        line, clear = _blend_window(table, prior, pivot)
+        line, clear = _blend_window(table, prior, pivot, period_ns)
         span = float(table[-1, 6] - table[0, 0])
         if not clear or span < FIRST_WINDOW_S * S:
             return line
         table = table[table[:, 6] >= pivot - SHRINK * span]
 
 
-def _blend_window(table: Floats, prior: SlopePrior, pivot: float) -> tuple[Line, bool]:
+def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: float) -> tuple[Line, bool]:
     """The line of one window, and whether a third of the window stays clear of it."""
     low_x, low_y, mean_x, mean_y, sd_mean = (table[:, i] for i in range(5))
     span = max(float(low_x[-1] - low_x[0]), 1.0)
     flat = mean_y - low_y - prior.slope * (mean_x - low_x)
-    spread = max(float(np.median(flat)), 1.0)
+    spread = max(float(np.median(flat)), 0.5 * period_ns, 1.0)
     minutes = span / (60 * S)
     weight = [1 / prior.sigma**2]
     slopes = [prior.slope]
@@ -184,7 +185,10 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float) -> tuple[Line,
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
-            sd_hull = 2.5 / (1 + minutes) * spread / span * (1 + span / (2 * length))
+            height = low_y - slope_hull * low_x
+            unsteady = 4 * float(np.median(height) - height.min()) / spread
+            doubt = 1.0 if period_ns else max(min(unsteady, 1.0) ** 2, math.exp(-2 * minutes))
+            sd_hull = 2.5 / (1 + minutes) * doubt * spread / span * (1 + span / (2 * length))
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
             slopes.append(slope_hull)

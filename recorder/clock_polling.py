@@ -17,6 +17,7 @@ from recorder.clock_fit import Floats, Line, SlopePrior
 from recorder.clock_grid import (
     LAW_PRIOR,
     RESIDUES,
+    STEPS,
     DelayLaw,
     Fitted,
     GridPoints,
@@ -30,12 +31,15 @@ S = 1e9  # ns
 WINDOW_S = 120.0
 MIN_SPAN_S = 1.5
 YOUNG_S = 20.0
-CURVATURE = (1.0, 10.0, 40.0)  # one sigma of the curvature, ns/s^2: least, at first, most
+CURVATURE = (1.0, 10.0, 25.0)  # one sigma of the curvature, ns/s^2: least, at first, most
 FREE = 1e12
 STARTS = (0.05, 0.3, 0.6)  # of the period below the lowest point
 MIN_KEPT = 0.35
 HIGH_RANK, HIGH_SIGMA = 0.12, 4.0
+FIRST_STEPS = 12
+RIVAL = 4.0  # a maximum less than this below the best one may be the true one
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
+RECENT = 30  # buckets
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
 COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows unless the delays are longer still
@@ -79,6 +83,8 @@ class PollingGrid:
         self.points: list[GridPoints] = []
         self._last: _Start | None = None
         self._load = 0.0
+        self._rivalry = 0.0
+        self._real = False
         self._fits = 0
         self._bending = CURVATURE[1] ** 2  # variance of the curvature, learnt from its estimates
 
@@ -86,6 +92,11 @@ class PollingGrid:
         """A new sync epoch: the polls go on, the points and the level do not."""
         self.points = []
         self._last = None
+
+    @property
+    def period_ns(self) -> float:
+        """Of the polls; 0 without a grid, or when steady delays make the device's own rhythm look like one."""
+        return self.tracker.period_ns if self._real else 0.0
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:
         """Learn from a bucket's samples."""
@@ -112,6 +123,9 @@ class PollingGrid:
         bucket = np.repeat(np.arange(len(points)), [p.x.size for p in points])
         t = (x - end) / S
         height = y - line.offset - line.slope * x
+        self._real = spreads_over_polls(points, height, count)
+        if not self._real:
+            return None
         basis = np.stack([np.ones_like(t), t, t**2], axis=1)
         centre = np.array([0.0, (prior.slope - line.slope) * S, 0.0])
         precision = np.diag([FREE**-2, (prior.sigma * S) ** -2, 1 / self._bending])
@@ -121,7 +135,6 @@ class PollingGrid:
             return None
         fitted, kept = best
         covariance = np.asarray(np.linalg.inv(fitted.information), dtype=np.float64)
-        self._learn_bending(fitted.weights[2], covariance[2, 2])
         self._last = _Start(
             end,
             line.at(end) + fitted.weights[0],
@@ -129,8 +142,9 @@ class PollingGrid:
             fitted.weights[2] / S**2,
             fitted.law,
         )
-        jitter = float(np.median([p.jitter_ns for p in points]))
-        trust, sd = self._trust(problem, fitted, covariance, kept, t, jitter)
+        trust, sd = self._trust(problem, fitted, covariance, kept, t)
+        if trust > 0.5:
+            self._learn_bending(fitted.weights[2], covariance[2, 2])
         residues = np.sum([p.residues for p in points], axis=0)
         if on_coarser_grid(residues):
             trust = 0.0
@@ -165,7 +179,10 @@ class PollingGrid:
             mean = float(problem.count @ problem.height / problem.count.sum()) - low - 0.5 * problem.period
             law = LAW_PRIOR + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
             starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in STARTS]
-        best = max((problem.climb(*start) for start in starts), key=lambda fit: fit.value)
+        fits = [problem.climb(*start, FIRST_STEPS if len(starts) > 1 else STEPS) for start in starts]
+        best = max(fits, key=lambda fit: fit.value)
+        rivals = [fit.weights[0] - best.weights[0] for fit in fits if fit.value > best.value - RIVAL]
+        self._rivalry = max(0.5 * abs(apart) for apart in rivals) if len(fits) > 1 else 0.7 * self._rivalry
         if not math.isfinite(best.value):
             return None
         kept = without_late(problem, everything, best.weights, best.law, bucket)
@@ -183,12 +200,12 @@ class PollingGrid:
         self._bending += weight * (min(max(free**2 - noise, least**2), most**2) - self._bending)
 
     def _trust(
-        self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats, jitter: float
+        self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats
     ) -> tuple[float, tuple[float, float]]:
         """How far to believe the fit, and one sigma of its height and slope at the newest end."""
-        sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance))
+        sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance), self._rivalry)
         sd_slope = math.sqrt(max(covariance[1, 1], 0.0))
-        fitness = judge(problem, fitted, kept, t, jitter)
+        fitness = judge(problem, fitted, kept, t)
         self._load = max(0.85 * self._load, fitness.load)
         share = float(kept.sum()) / max(float(sum(p.count.sum() for p in self.points)), 1.0)
         trust = fitness.trust * ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
@@ -214,18 +231,15 @@ class Fitness:
     load: float
 
 
-def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats, jitter_ns: float) -> Fitness:
-    """Test a fit: do the delays spread over polls at all, do they follow the law, and the same one throughout?"""
+def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> Fitness:
+    """Test a fit: do the delays follow the law, and the same one throughout?"""
     distance = problem.height - problem.basis @ fitted.weights
     law = DelayLaw.of(fitted.law)
-    low, high = weighted_quantiles(distance, kept, (0.1, 0.9))
-    if high - low < WIDE * jitter_ns:
-        return Fitness(0.0, 0.0)
     upper, _ = law.cdf(distance)
     lower, _ = law.cdf(distance - problem.period)
     kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
     misfit = misfit_of(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
-    trust = ramp(misfit, 0.025, 0.045)
+    trust = ramp(misfit, 0.025, 0.045) * ramp(law.shape, 5.5, 7.5)  # at the bound it is another law
     if problem.period > COARSE_NS:
         trust *= ramp(law.mean_ns / problem.period, 0.25, 0.1)
     return Fitness(trust, load_dependence(lower, upper, kept, t))
@@ -250,13 +264,17 @@ def without_late(
 
 
 def ramp(value: float, good: float, bad: float) -> float:
+    """1 at good or better, 0 at bad or worse."""
     return min(max((bad - value) / (bad - good), 0.0), 1.0)
 
 
-def weighted_quantiles(values: Floats, weight: Floats, shares: tuple[float, ...]) -> list[float]:
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return [float(values[order][min(np.searchsorted(total, q * total[-1]), values.size - 1)]) for q in shares]
+def spreads_over_polls(points: list[GridPoints], height: Floats, count: Floats) -> bool:
+    """Whether the delays spread wider than what is taken for the jitter of the polls, within seconds or in all."""
+    spread, jitter = np.median([(p.spread_ns, p.jitter_ns) for p in points[-RECENT:]], axis=0)
+    order = np.argsort(height)
+    total = np.cumsum(count[order])
+    low, high = height[order][np.searchsorted(total, (0.25 * total[-1], 0.75 * total[-1]))]
+    return bool(max(spread, high - low) > WIDE * jitter)
 
 
 def misfit_of(lower: Floats, upper: Floats, count: Floats, phase: Floats) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from recorder.clock_fit import Floats, hull_slope
 from recorder.clock_grid import LAW_PRIOR, Fitted, GridPoints, GridTracker, IntervalFit, snap
-from recorder.clock_polling import judge, on_coarser_grid, ramp, without_late
+from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, without_late
 
 Ints = NDArray[np.int64]
 
@@ -170,6 +170,8 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | No
     basis = hat_basis(at_x, knots_x)
     precision = bending(knots_x, GRID_CURVATURE) + FREE * np.eye(knots_x.size)
     height = at_y - beneath.at(at_x)
+    if not spreads_over_polls(points, height, count):
+        return None
     level = beneath.at(knots_x)
     problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
     low = float(height.min())
@@ -188,8 +190,7 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | No
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
-    jitter_ns = float(np.median([p.jitter_ns for p in points]))
-    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S, jitter_ns)
+    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S)
     if on_coarser_grid(np.sum([p.residues for p in points], axis=0)):
         return 0.0
     return fitness.trust * ramp(fitness.load, 0.02, 0.04)
