@@ -15,6 +15,7 @@ from types import FrameType
 
 import click
 from rich.console import Console
+from rich.progress import Progress
 
 from recorder import simulation
 from recorder.errors import ConfigError, RecorderError
@@ -196,8 +197,9 @@ def check(verbose: bool, recording: Path, as_json: bool, deep: bool) -> None:
     Example:
       rigtape check demo/2026-11-22T10-00-00Z
     """
-    with clear_errors(verbose):
-        report = check_recording(recording, deep=deep)
+    with clear_errors(verbose), Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(f"reading {recording}", total=1.0)
+        report = check_recording(recording, deep=deep, progress=lambda done: bar.update(task, completed=done))
     if as_json:
         click.echo(report.to_json())
     else:
