@@ -325,12 +325,21 @@ def make_driver(port: str, rate_hz: float = 10) -> NmeaDriver:
     return driver
 
 
-def test_fixes_over_a_pty_then_hang_up() -> None:
+def test_fixes_over_a_pty_then_hang_up(monkeypatch: pytest.MonkeyPatch) -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     driver = make_driver(os.ttyname(slave))
     driver.connect()
-    os.write(master, rmc() + gga() + gst())
+    os.write(master, rmc("115959.00") + gga("115959.00"))  # waited for its reader for an unknown time
+    link = driver._link
+    assert link is not None
+    discard = link.discard_input
+
+    def discard_then_send() -> None:
+        discard()
+        os.write(master, rmc() + gga() + gst())
+
+    monkeypatch.setattr(link, "discard_input", discard_then_send)
     stop = Event()
     data, fixes = b"", []
     for received in driver.read(stop):
@@ -340,6 +349,7 @@ def test_fixes_over_a_pty_then_hang_up() -> None:
             stop.set()
     assert data == rmc() + gga() + gst()
     assert [fix.accuracy_source for _, fix in fixes] == ["gst"]
+    monkeypatch.setattr(link, "discard_input", lambda: None)
     reading = driver.read(Event())
     os.close(slave)
     os.close(master)
@@ -363,6 +373,9 @@ class ScriptedLink:
     def read(self, timeout_s: float) -> tuple[int, bytes]:
         arrival_ms, data = next(self.reads)
         return arrival_ms * 1_000_000, data
+
+    def discard_input(self) -> None:
+        pass
 
 
 def scripted(
