@@ -68,6 +68,10 @@ class Line:
         """The same line, moved down (by a negative number)."""
         return replace(self, offset=self.offset + by_ns)
 
+    def less_sure(self, sigma_ns: float) -> Line:
+        """The same line with another error of its height."""
+        return replace(self, sd_level_ns=math.hypot(self.sd_level_ns, sigma_ns))
+
     def sigma_ns(self, x: float) -> float:
         """One sigma of the height at x."""
         return math.hypot(self.sd_level_ns, self.sd_slope * (x - self.pivot_x))
@@ -186,8 +190,8 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: flo
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
             height = low_y - slope_hull * low_x
-            unsteady = 4 * float(np.median(height) - height.min()) / spread
-            doubt = 1.0 if period_ns else max(min(unsteady, 1.0) ** 2, math.exp(-2 * minutes))
+            unsteady = min(4 * float(np.median(height) - height.min()) / spread, 1.0)
+            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-2 * minutes))
             sd_hull = 2.5 / (1 + minutes) * doubt * spread / span * (1 + span / (2 * length))
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
@@ -204,5 +208,19 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: flo
     thirds = np.array_split(above, 3)
     limit = max(0.5 * spread, 2 * float(np.median(above)))
     clear = above.size >= 9 and any(float(part.min()) > limit for part in thirds)
-    level = max(float(np.median(above)) / math.sqrt(above.size), 0.02 * spread)
+    sd_slope = min(sd_slope, _slope_room(low_x, above, lowest) + 0.5 * spread / span * math.exp(-minutes))
+    unsteady = min(4 * float(np.median(above)) / spread, 1.0)
+    gap = float(np.sort(above)[min(2, above.size - 1)])
+    level = max(gap, 0.005 * spread) + 0.2 * unsteady * spread / (1 + minutes)
     return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear
+
+
+def _slope_room(x: Floats, above: Floats, lowest: int) -> float:
+    """How far a line may turn about the lowest point without rising over another one."""
+    dx = np.abs(x - x[lowest])
+    steepest = [
+        float((above[side] / dx[side]).min())
+        for side in (dx > 0) & np.stack([x < x[lowest], x > x[lowest]])
+        if side.any()
+    ]
+    return max(steepest) if len(steepest) == 2 else math.inf

@@ -42,6 +42,8 @@ FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a 
 RECENT = 30  # buckets
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
+COARSE_ERROR = 0.02
+STEADIEST, LOOSEST = 0.003, 0.015  # jitter of polls in periods; else it may be the device's own rhythm
 COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows unless the delays are longer still
 
 
@@ -97,6 +99,19 @@ class PollingGrid:
     def period_ns(self) -> float:
         """Of the polls; 0 without a grid, or when steady delays make the device's own rhythm look like one."""
         return self.tracker.period_ns if self._real else 0.0
+
+    def unseen_ns(self, age_s: float) -> float:
+        """One sigma of the height above the floor that the polls may hide from a line under the arrivals.
+
+        Until a sample's phase has slid over the edge of a poll, anything within a period is possible; a slow period
+        is a latency timer on top of finer polls, whose beat against it is slow.
+        """
+        period = self.tracker.period_ns
+        jitter = float(np.median([p.jitter_ns for p in self.points[-RECENT:]])) if self.points else 0.0
+        if not STEADIEST * period < jitter < LOOSEST * period:
+            return 0.0
+        hidden = 0.0 if self._real else period / math.sqrt(12) * math.exp(-age_s / 60)
+        return math.hypot(hidden, COARSE_ERROR * period if period > COARSE_NS else 0.0)
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:
         """Learn from a bucket's samples."""
@@ -240,6 +255,7 @@ def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> Fitn
     kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
     misfit = misfit_of(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
     trust = ramp(misfit, 0.025, 0.045) * ramp(law.shape, 5.5, 7.5)  # at the bound it is another law
+    trust *= ramp(law.mean_ns / problem.period, 0.12, 0.04)  # as good as constant: the lowest points say it better
     if problem.period > COARSE_NS:
         trust *= ramp(law.mean_ns / problem.period, 0.25, 0.1)
     return Fitness(trust, load_dependence(lower, upper, kept, t))

@@ -19,6 +19,8 @@ from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_po
 Ints = NDArray[np.int64]
 
 S = 1e9  # ns
+PIECE_S = 1800.0  # longer epochs are refined in pieces, which bounds time and memory
+SEAM_S = 60.0  # over which one piece gives way to the next
 BIN_S = 0.25
 KNOT_S = (150.0, 75.0, 37.5)
 MIN_SPAN_S = 1.0  # the slope of a shorter epoch is taken as nominal
@@ -197,7 +199,25 @@ def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoi
 
 
 def refine_epoch(x: Floats, y: Floats) -> Curve:
-    """The curve of one sync epoch from its samples in ascending order."""
+    """The curve of one sync epoch from its samples in ascending order; a long one piece by piece."""
+    pieces = min(int((x[-1] - x[0]) / (PIECE_S * S)), x.size // 1000) + 1
+    if pieces == 1:
+        return _refine_piece(x, y)
+    edges = np.linspace(x[0], x[-1], pieces + 1)
+    knots_x = np.arange(x[0], x[-1] + SEAM_S * S, 0.1 * SEAM_S * S)
+    heights, weights = np.zeros_like(knots_x), np.zeros_like(knots_x)
+    for left, right in pairwise(edges.tolist()):
+        part = slice(*np.searchsorted(x, (left - SEAM_S * S, right + SEAM_S * S)).tolist())
+        if part.stop - part.start < 2:
+            continue
+        inside = np.minimum(knots_x - left, right - knots_x) / (SEAM_S * S) + 1
+        weight = np.clip(0.5 * inside, 1e-9, 1.0)
+        heights += weight * _refine_piece(x[part], y[part]).at(knots_x)
+        weights += weight
+    return Curve(knots_x, heights / weights)
+
+
+def _refine_piece(x: Floats, y: Floats) -> Curve:
     beneath = envelope_by_data(x, y)
     found = grid_curve(x, y, beneath)
     if found is None or found[1] == 0.0:

@@ -68,11 +68,8 @@ class Pipeline:
 
     def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
         """Feed one sample with its arrival on the host's monotonic clock."""
-        summary = self._devices[device].summary
-        if isinstance(sample, LostFrame):
-            summary.dropped += 1
-        elif not isinstance(sample, ClockPairs):
-            summary.received += 1
+        if not isinstance(sample, ClockPairs):
+            self._devices[device].summary.received += 1
         self._timebase.take(device, arrival_ns, sample)
 
     def _place(self, stamped: Stamped) -> None:
@@ -95,20 +92,19 @@ class Pipeline:
         """
         assert device.camera is not None
         has_begun = device.last_picture_ns >= 0
-        if isinstance(sample, FrameSample):
-            usable = time_ns > device.last_picture_ns and (sample.is_keyframe or not device.wait_for_keyframe)
-            device.wait_for_keyframe = not usable
-            if usable:
-                device.last_picture_ns = time_ns
-                self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
-                return
-            if has_begun:
-                device.summary.dropped += 1
-            else:
-                device.summary.before_start += 1
-        else:
-            device.wait_for_keyframe = True
-        if has_begun and time_ns > device.last_picture_ns:
+        is_later = time_ns > device.last_picture_ns
+        if isinstance(sample, FrameSample) and is_later and (sample.is_keyframe or not device.wait_for_keyframe):
+            device.wait_for_keyframe = False
+            device.last_picture_ns = time_ns
+            self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
+            return
+        device.wait_for_keyframe = True
+        if not has_begun:
+            device.summary.before_start += 1
+            return
+        device.summary.received -= 1
+        device.summary.dropped += 1
+        if is_later:
             self._synchronizer.add_picture(device.camera, device_ns, time_ns, None)
 
     def advance(self, now_ns: int) -> None:

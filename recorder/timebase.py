@@ -50,7 +50,7 @@ class _Clock:
     name: str
     map: ClockMap
     hold_until_ns: int
-    epoch: int
+    epoch: int = -1  # none yet
     waiting: list[tuple[_DeviceStream, int, int, Sample]] = field(default_factory=list)
 
 
@@ -69,7 +69,7 @@ class Timebase:
         """Announce a device and the clock that stamps it."""
         if clock not in self._clocks:
             clock_map = ClockMap(tick_hz, wrap_bits)
-            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS, clock_map.epoch)
+            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS)
         shared = self._clocks[clock]
         self._streams[device] = _DeviceStream(
             device, shared, shared.map.stream(tick_hz, wrap_bits), tick_hz, latency_ns
@@ -104,9 +104,10 @@ class Timebase:
 
     def _watch_epoch(self, clock: _Clock, arrival_ns: int) -> None:
         if clock.map.epoch != clock.epoch:
+            if clock.epoch >= 0:
+                self._epochs_begun.append((clock.name, clock.map.epoch))
             clock.epoch = clock.map.epoch
             clock.hold_until_ns = max(clock.hold_until_ns, arrival_ns + HOLD_NS)
-            self._epochs_begun.append((clock.name, clock.epoch))
 
     def release(self, now_ns: int) -> list[Stamped]:
         """All samples fed so far but those of an epoch that is too young; those of one device in order."""
@@ -126,7 +127,7 @@ class Timebase:
         point_host_ns = None
         if isinstance(sample, ScanSample) and len(sample.points):
             ticks = np.rint(sample.points["timestamp"] * entry.tick_hz).astype(np.int64)
-            point_host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
+            point_host_ns = np.minimum(entry.clock.map.host_ns(entry.stream.unwrap(ticks)), arrival_ns)
             host_ns = int(point_host_ns.max())
         host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
         entry.last_host_ns = host_ns

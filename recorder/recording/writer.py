@@ -139,10 +139,11 @@ class RecordingWriter:
             pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None))
         self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
 
-    def close(self, duration_ns: int, stopped_by: str) -> list[str]:
+    def close(self, duration_ns: int, stopped_by: str, *, complete: bool = True) -> list[str]:
         """Finish all files; recording.json says complete last of all, unless a file could not be written or finished.
 
-        Gives what went wrong, a line each; the other files are closed all the same.
+        complete: False when not all that came was handed over. Gives what went wrong, a line each; the other files are
+        closed all the same.
         """
         faults = self._faults
         for camera, video in zip(self.manifest.cameras, self.videos, strict=True):
@@ -165,7 +166,7 @@ class RecordingWriter:
         self.manifest.files = dict(sorted(files.items()))
         self.manifest.duration_s = duration_ns / NS_PER_S
         self.manifest.stopped_by = stopped_by
-        if not faults:
+        if complete and not faults:
             self.manifest.state = "complete"
         try:
             write_manifest(self.folder, self.manifest)

@@ -425,7 +425,8 @@ def test_samples_that_find_no_room_are_counted_and_told(bench, monkeypatch, coun
     stream = manifest.devices["imu"].stream
     assert counts_are_true(folder) == {"imu": 2}
     assert (stream.received, stream.dropped) == (2, 48)
-    assert kinds_of(folder, "imu") == ["connected", "drop"]
+    assert kinds_of(folder, "imu") == ["connected", "warning", "drop"]
+    assert events_of(folder)[-1]["count"] == 48
 
 
 def test_pictures_that_find_no_room_keep_their_place(bench, monkeypatch, pictures, counts_are_true, seen):
