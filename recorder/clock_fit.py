@@ -89,7 +89,8 @@ def summarise(x: Floats, y: Floats, slope: float) -> Bucket:
     """Condense samples into one bucket; heights are compared along `slope`."""
     height = y - slope * (x - x[0])
     low = int(np.argmin(height))
-    quarter, half, most = np.quantile(height, (0.25, 0.5, 0.75)) if height.size > 1 else (height[0],) * 3
+    order = np.sort(height)
+    quarter, half, most = (float(order[int(share * order.size)]) for share in (0.25, 0.5, 0.75))
     clipped = np.minimum(height, half + CLIP * max(most - quarter, half - height[low]))
     mean_x = float(x.mean())
     mean_y = float(clipped.mean()) + slope * (mean_x - float(x[0]))

@@ -9,6 +9,7 @@ weight stays with the line beneath.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,7 @@ FIRST_STEPS = 12
 RIVAL = 4.0  # a maximum less than this below the best one may be the true one
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
 RECENT = 30  # buckets
+MAX_WAITING = 256
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
 COARSE_ERROR = 0.02
@@ -78,11 +80,17 @@ class _Start:
 
 
 class PollingGrid:
-    """Points on the polls of one clock's link and the fit to them."""
+    """Points on the polls of one clock's link and the fit to them.
+
+    `feed` and `restart` only take note; all work is done in `fit`, which may run in another thread.
+    """
 
     def __init__(self, tracker: GridTracker | None = None):
         self.tracker = tracker or GridTracker()
         self.points: list[GridPoints] = []
+        self._waiting: deque[tuple[int, Floats, Floats, float]] = deque(maxlen=MAX_WAITING)
+        self._epoch = 0
+        self._points_epoch = 0
         self._last: _Start | None = None
         self._load = 0.0
         self._rivalry = 0.0
@@ -92,8 +100,7 @@ class PollingGrid:
 
     def restart(self) -> None:
         """A new sync epoch: the polls go on, the points and the level do not."""
-        self.points = []
-        self._last = None
+        self._epoch += 1
 
     @property
     def period_ns(self) -> float:
@@ -114,20 +121,27 @@ class PollingGrid:
         return math.hypot(hidden, COARSE_ERROR * period if period > COARSE_NS else 0.0)
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:
-        """Learn from a bucket's samples."""
-        period = self.tracker.period_ns
-        points = snap(x, y, slope, self.tracker)
-        if self.tracker.period_ns != period:
-            self.restart()
-        elif points is not None:
-            self.points.append(points)
-            while x[-1] - self.points[0].x[0] > 1.1 * WINDOW_S * S:
-                del self.points[0]
+        """Take note of a bucket's samples."""
+        self._waiting.append((self._epoch, x, y, slope))
+
+    def _take_in(self) -> None:
+        """Put the samples that wait on their polls."""
+        while self._waiting:
+            epoch, x, y, slope = self._waiting.popleft()
+            period = self.tracker.period_ns
+            points = snap(x, y, slope, self.tracker)
+            if epoch != self._points_epoch or self.tracker.period_ns != period:
+                self.points, self._last, self._points_epoch = [], None, epoch
+            if points is not None:
+                self.points.append(points)
+                while x[-1] - self.points[0].x[0] > 1.1 * WINDOW_S * S:
+                    del self.points[0]
 
     def fit(self, line: Line, prior: SlopePrior) -> GridLine | None:
         """The grid's curve near `line`, or nothing when there is no grid worth using."""
-        points, period = self.points[:], self.tracker.period_ns
-        if not points or not period:
+        self._take_in()
+        points, period = self.points, self.tracker.period_ns
+        if not points or not period or self._points_epoch != self._epoch:
             return None
         end = float(points[-1].x.max())
         points = [p for p in points if p.x[-1] > end - WINDOW_S * S]

@@ -47,7 +47,12 @@ class StatusDisplay:
 
 
 def _table(status: TakeStatus) -> Table:
-    table = Table(title=f"recording {status.folder} · {status.elapsed_s:.0f} s · {_disk(status)}", title_justify="left")
+    table = Table(
+        box=None,
+        pad_edge=False,
+        title=f"recording {status.folder} · {status.elapsed_s:.0f} s · {_disk(status)}",
+        title_justify="left",
+    )
     table.add_column("device")
     table.add_column("kind")
     for column in ("rate Hz", "count", "lost", "dropped", "age ms"):
@@ -84,7 +89,7 @@ def _disk(status: TakeStatus) -> str:
 
 def print_summary(console: Console, manifest: Manifest) -> None:
     """What a finished take holds."""
-    table = Table()
+    table = Table(box=None, pad_edge=False)
     for column in ("device", "kind"):
         table.add_column(column)
     for column in ("received", "written", "lost", "dropped", "late", "before start", "incomplete"):

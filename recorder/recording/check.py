@@ -294,16 +294,9 @@ def _check_files(folder: Path, manifest: Manifest, deep: bool, findings: Finding
 
 def print_report(report: Report, console: Console) -> None:
     """The report for people: streams, videos, findings, verdict."""
-    table = Table(
-        Column("stream", no_wrap=True),
-        "count",
-        "rate Hz",
-        "expected",
-        "from s",
-        "to s",
-        "gaps",
-        title=escape(report.folder),
-    )
+    console.print(report.folder, markup=False, soft_wrap=True)
+    numbers = (Column(name, justify="right") for name in ("count", "rate Hz", "expected", "from s", "to s", "gaps"))
+    table = Table(Column("stream", no_wrap=True), *numbers, box=None, pad_edge=False)
     for stream in report.streams:
         rates = ("" if rate is None else f"{rate:.2f}" for rate in (stream.rate_hz, stream.expected_hz))
         span = (f"{stream.first_s:.3f}", f"{stream.last_s:.3f}")
