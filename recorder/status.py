@@ -2,9 +2,10 @@
 
 import time
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from drivers.samples import DeviceEvent
 from recorder.recording.manifest import Manifest
@@ -46,13 +47,9 @@ class StatusDisplay:
             self._console.print(f"{device}: {event.kind}: {event.text}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _table(status: TakeStatus) -> Table:
-    table = Table(
-        box=None,
-        pad_edge=False,
-        title=f"recording {status.folder} · {status.elapsed_s:.0f} s · {_disk(status)}",
-        title_justify="left",
-    )
+def _table(status: TakeStatus) -> Group:
+    title = Text(f"recording {status.folder} · {status.elapsed_s:.0f} s · {_disk(status)}", style="bold")
+    table = Table(box=None, pad_edge=False)
     table.add_column("device")
     table.add_column("kind")
     for column in ("rate Hz", "count", "lost", "dropped", "age ms"):
@@ -69,7 +66,7 @@ def _table(status: TakeStatus) -> Table:
             "-" if device.lag_s is None else f"{device.lag_s * 1e3:.0f}",
             style=style,
         )
-    return table
+    return Group(title, table)
 
 
 def _plain(status: TakeStatus) -> str:
