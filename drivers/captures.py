@@ -8,9 +8,11 @@ chunks a read comes back empty after its timeout, as it does on a live line; whe
 link opens again with the next chunk. So a driver gives the same samples as in the take that made the tape.
 """
 
+import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 from typing import Protocol
@@ -31,6 +33,9 @@ TAIL_NS = 1_500_000_000
 """So much time passes after the last chunk: it ends epochs and bursts that only silence ends."""
 LEAST_WAIT_NS = 1_000_000
 CLOCK_STEP_NS = 1_000_000_000
+NMEA_DATE = re.compile(
+    rb"\$..RMC,[0-9.]+,A,(?:[^,\n]{0,20},){6}(\d\d)(\d\d)(\d\d)[,*]|\$..ZDA,[0-9.]+,(\d\d),(\d\d),(\d{4})[,*]"
+)
 SURVEYED_PACKETS = 20_000
 TELL_EVERY = 4096
 
@@ -136,7 +141,7 @@ class PacketCapture:
 class ByteFile:
     """Plain bytes as they came from a serial line, without times: given out at the pace of the baud rate.
 
-    Their time begins at the file's time of modification, as nothing better is known.
+    Their time begins with the first date in an NMEA log, else at the file's time of modification: no better is known.
     """
 
     path: Path
@@ -149,8 +154,9 @@ class ByteFile:
     def chunks(self) -> Iterator[Chunk]:
         """All it holds, in order."""
         try:
-            begin_ns = self.path.stat().st_mtime_ns
             with self.path.open("rb", buffering=BUFFER_BYTES) as file:
+                begin_ns = _nmea_utc_ns(file.read(BUFFER_BYTES)) or self.path.stat().st_mtime_ns
+                file.seek(0)
                 while data := file.read(PIECE_BYTES):
                     self.position += len(data)
                     yield Chunk(begin_ns + self.position * BITS_PER_BYTE * NS_PER_S // self.baud, data)
@@ -160,6 +166,18 @@ class ByteFile:
     def events(self) -> list[DeviceEvent]:
         """Nothing is to be told."""
         return []
+
+
+def _nmea_utc_ns(data: bytes) -> int | None:
+    """Start of the first day that an NMEA sentence with a date names, None where there is none."""
+    for match in NMEA_DATE.finditer(data):
+        day, month, year = map(int, match.group(1, 2, 3) if match[1] else match.group(4, 5, 6))
+        try:
+            date = datetime(year + (2000 if year < 80 else 1900 if year < 100 else 0), month, day, tzinfo=UTC)
+        except ValueError:
+            continue
+        return int(date.timestamp()) * NS_PER_S
+    return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -198,11 +198,13 @@ class _Decoding:
         if self._first_ns is None and item.chunks:
             self._first_ns = item.chunks[0].arrival_ns
         samples = [(self._arrival_ns(arrival_ns, sample), sample) for arrival_ns, sample in item.samples]
-        self._now_ns = max(self._now_ns, samples[-1][0] if self._device_time and samples else self._link_ns())
-        if item.chunks or samples:
-            self._last_ns = self._now_ns
         if samples and self._pipeline is None:
             self._begin(samples[0][0])
+        if self._device_time is None:
+            self._now_ns = self._links.monotonic_ns()
+            self._last_ns = item.chunks[-1].arrival_ns if item.chunks else self._last_ns
+        elif samples:
+            self._now_ns = self._last_ns = samples[-1][0]
         for event in item.events:
             self._note(event)
         if self._pipeline is None:
@@ -212,9 +214,6 @@ class _Decoding:
         if self._now_ns - self._advanced_ns >= ADVANCE_NS:
             self._advanced_ns = self._now_ns
             self._pipeline.advance(self._now_ns)
-
-    def _link_ns(self) -> int:
-        return 0 if self._device_time else self._links.monotonic_ns()
 
     def _arrival_ns(self, arrival_ns: int, sample: Sample) -> int:
         """When the sample came: of plain bytes, what the device's own clock says, where the first one has it."""
@@ -229,6 +228,7 @@ class _Decoding:
     def _begin(self, arrival_ns: int) -> None:
         """Create the recording."""
         first_ns = arrival_ns if self._device_time or self._first_ns is None else self._first_ns
+        self._advanced_ns = self._disk_ns = self._now_ns = first_ns
         start_ns = self._tape.start_ns if self._tape else first_ns - LEAD_NS
         device = self._device
         summary = DeviceSummary(
@@ -283,7 +283,7 @@ class _Decoding:
             return f"stamps of the capture {name}"
         if self._device_time and self._device_time.is_utc:
             return f"UTC of the receiver in {name}, which has no arrival times"
-        return f"modification time of {name}, which has no arrival times"
+        return f"a guess (date in {name} or its time of modification), as it has no arrival times"
 
     def _arrivals(self) -> str:
         if self._links.capture.has_arrivals:
