@@ -25,7 +25,7 @@ NMEA = Path(__file__).parent.parent / "data" / "nmea" / "rx210.log"
 
 def msop(frame: int, sequence: int) -> bytes:
     """An M1 packet whose 125 points all lie at 10 m straight ahead, but for the first channel's: no return."""
-    time_us = START_S * 1_000_000 + frame * 100_000 + (sequence - 1) * 158
+    time_us = START_S * 1_000_000 + frame * 100_000 + (sequence - 1) * 3_333
     head = struct.pack(
         ">4sHHBBHII10xBB", bytes.fromhex("55AA5AA5"), sequence, 1, 4, 0, 0, *divmod(time_us, 10**6), 16, 100
     )
@@ -36,7 +36,7 @@ def msop(frame: int, sequence: int) -> bytes:
 
 def datagrams(frames: int, loss: tuple[int, int] | None = None, source: tuple[str, int] = LIDAR) -> list[Chunk]:
     return [
-        Chunk(frame * 10**8 + sequence * 158_000 + 200_000, msop(frame, sequence), source, ("192.168.1.102", 6699))
+        Chunk(frame * 10**8 + sequence * 3_333_000 + 200_000, msop(frame, sequence), source, ("192.168.1.102", 6699))
         for frame in range(frames)
         for sequence in range(1, PACKETS + 1)
         if (frame, sequence) != loss
@@ -94,8 +94,8 @@ def test_a_lidar_capture_becomes_a_recording(tmp_path: Path) -> None:
     manifest = decoded.manifest
     assert manifest.state == "complete"
     assert manifest.stopped_by == "end of capture"
-    assert manifest.duration_s == pytest.approx(1.3, abs=0.02)
-    assert manifest.utc_at_time_0.utc_ns == START_S * 10**9 + 358_000 - 200_000_000
+    assert manifest.duration_s == pytest.approx(1.4, abs=0.02)
+    assert manifest.utc_at_time_0.utc_ns == START_S * 10**9 + 3_533_000 - 200_000_000
     assert manifest.utc_at_time_0.source == "stamps of the capture lidar.pcapng"
     device = manifest.devices["robosense"]
     assert (device.stream.received, device.stream.written, device.stream.lost) == (12, 12, 1)
@@ -122,7 +122,7 @@ def test_settings_reach_the_driver(tmp_path: Path) -> None:
     decoded = Decoding(capture, "robosense", tmp_path / "out", "keep_invalid=true", "latency_s=0.05")
     assert decoded.lines[0]["lidar"]["points"] == PACKETS * 125
     assert decoded.manifest.devices["robosense"].latency_s == 0.05
-    assert decoded.lines[0]["time"] == pytest.approx(0.2 + 30 * 158e-6 - 0.05, abs=0.002)
+    assert decoded.lines[0]["time"] == pytest.approx(0.2 + 29 * 3333e-6 - 0.05, abs=0.002)
 
 
 def test_one_of_several_lidars_must_be_chosen(tmp_path: Path) -> None:
