@@ -2,6 +2,9 @@
 
 Arrival is in nanoseconds of the host's monotonic clock. A serial line has no kernel stamp, so the clock is read right
 after the bytes; a datagram carries the kernel's stamp of its reception.
+
+A driver opens its link and asks for the time through `Links`, its attribute `links`: LIVE, or a capture that is played
+instead of the device (drivers.captures).
 """
 
 import contextlib
@@ -36,6 +39,56 @@ SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
 _TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
+
+
+class SerialPort(Protocol):
+    """A serial line as drivers use it, see SerialLink."""
+
+    def read(self, timeout_s: float) -> tuple[int, bytes]:
+        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError."""
+
+    def discard_input(self) -> None:
+        """Throw away what waits unread and came at a time that is not known. Raises DeviceError."""
+
+    def write(self, data: bytes) -> Chunk:
+        """Send bytes; gives the chunk for the tape. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Close the port."""
+
+
+class UdpPorts(Protocol):
+    """The UDP ports of one device as drivers use them, see UdpLink."""
+
+    address: str
+    foreign: int
+    kernel_drops: int
+    receive_buffer_bytes: int
+
+    def read(self, timeout_s: float) -> list[Chunk]:
+        """What has come on all ports, in order of arrival; empty after `timeout_s`. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Close all ports."""
+
+
+class Links(Protocol):
+    """What a driver reaches the world through: links to its device, and the time on whose clock arrivals are."""
+
+    def serial(self, port: str, baud: int) -> SerialPort:
+        """Open a serial port. Raises DeviceError."""
+
+    def udp(self, address: str, ports: tuple[int, ...]) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
+
+    def monotonic_ns(self) -> int:
+        """The time now, on the clock of arrivals."""
+
+    def utc_ns(self) -> int:
+        """UTC now, in nanoseconds since 1970."""
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass."""
 
 
 class SerialLink:
@@ -200,6 +253,33 @@ class UdpLink:
             self._readable.unregister(descriptor)
             udp.close()
         self._sockets.clear()
+
+
+class LiveLinks:
+    """Real devices and real time."""
+
+    def serial(self, port: str, baud: int) -> SerialPort:
+        """Open a serial port. Raises DeviceError."""
+        return SerialLink(port, baud)
+
+    def udp(self, address: str, ports: tuple[int, ...]) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
+        return UdpLink(address, ports)
+
+    def monotonic_ns(self) -> int:
+        """The host's monotonic clock."""
+        return time.monotonic_ns()
+
+    def utc_ns(self) -> int:
+        """The host's wall clock."""
+        return time.time_ns()
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass."""
+        time.sleep(duration_s)
+
+
+LIVE: Links = LiveLinks()
 
 
 class CountsBadInput(Protocol):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from drivers.device import DeviceConfig
 from drivers.samples import (
     ClockPairs,
+    DeviceEvent,
     FixSample,
     FrameSample,
     ImuSample,
@@ -183,3 +184,11 @@ def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int) -> ClockSumm
         resets=clock.resets,
         wraps=clock.wraps,
     )
+
+
+def count_event(summary: StreamSummary, event: DeviceEvent) -> None:
+    """Add what an event says was lost or dropped to the counts of its stream."""
+    if event.kind == "gap":
+        summary.lost += event.count
+    elif event.kind == "drop":
+        summary.dropped += event.count

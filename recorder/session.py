@@ -21,7 +21,7 @@ from calibration.model import Calibration, CalibrationError, dump, load_calibrat
 from drivers.device import DeviceError, Driver, received
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, ScanSample
 from recorder.errors import ConfigError, RecorderError, StorageError
-from recorder.pipeline import DeviceInTake, Pipeline
+from recorder.pipeline import DeviceInTake, Pipeline, count_event
 from recorder.recording.folder import check_output, create_take_folder, free_bytes, low_water_bytes
 from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, StreamSummary
 from recorder.recording.work import ByteQueue
@@ -291,12 +291,8 @@ class Take:
 
     def _note(self, name: str, event: DeviceEvent) -> None:
         """Write an event down, count what it says was lost, and tell the user."""
-        summary = self._devices[name].summary
-        if event.kind == "gap":
-            summary.lost += event.count
-        elif event.kind == "drop":
-            summary.dropped += event.count
-        elif event.kind == "connected":
+        count_event(self._devices[name].summary, event)
+        if event.kind == "connected":
             self._connected.add(name)
             self._manifest.devices[name].identity = self._drivers[name].identity
         elif event.kind == "lost":

@@ -4,6 +4,7 @@ import time
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
@@ -43,8 +44,45 @@ class StatusDisplay:
 
     def event(self, device: str, event: DeviceEvent) -> None:
         """Tell of an event that a user should see at once."""
-        if event.kind not in QUIET_EVENTS:
-            self._console.print(f"{device}: {event.kind}: {event.text}", markup=False, highlight=False, soft_wrap=True)
+        _print_event(self._console, device, event)
+
+
+class DecodeProgress:
+    """Shows how far a capture has been read; a context manager."""
+
+    def __init__(self, console: Console) -> None:
+        """console: where to write; a bar if it is a terminal, else a line now and then."""
+        self._console = console
+        self._bar = Progress(console=console, transient=True) if console.is_terminal else None
+        self._task = self._bar.add_task("decoding", total=None) if self._bar is not None else None
+        self._last_line_s = time.monotonic()
+
+    def __enter__(self) -> "DecodeProgress":
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def show(self, position_bytes: int, size_bytes: int) -> None:
+        """Show how much has been read."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=position_bytes, total=size_bytes)
+        elif time.monotonic() - self._last_line_s >= PLAIN_EVERY_S:
+            self._last_line_s = time.monotonic()
+            share = 100 * position_bytes / max(size_bytes, 1)
+            self._console.print(f"{position_bytes / 1e6:.0f} of {size_bytes / 1e6:.0f} MB read ({share:.0f} %)")
+
+    def event(self, device: str, event: DeviceEvent) -> None:
+        """Tell of an event that a user should see at once."""
+        _print_event(self._console, device, event)
+
+
+def _print_event(console: Console, device: str, event: DeviceEvent) -> None:
+    if event.kind not in QUIET_EVENTS:
+        console.print(f"{device}: {event.kind}: {event.text}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _table(status: TakeStatus) -> Group:

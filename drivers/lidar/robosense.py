@@ -4,7 +4,6 @@ Datagrams wait in the socket's buffer for a few milliseconds and are then taken 
 of them, while each keeps the kernel's time of its arrival.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from threading import Event
 from typing import Annotated
@@ -22,7 +21,7 @@ from drivers.lidar.robosense_decoder import (
     is_measurement,
     packet_ticks,
 )
-from drivers.links import SILENCE_S, GarbageWatch, UdpLink
+from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, UdpPorts
 from drivers.samples import Chunk, ClockPairs, DeviceEvent, Received, Sample, ScanSample
 
 FIRST_PACKET_S = 3.0
@@ -71,9 +70,10 @@ class RobosenseDriver:
 
     def __init__(self, name: str, config: RobosenseConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
         self.streams = (StreamSpec("lidar", config.rate_hz, BYTES_PER_S),)
-        self._link: UdpLink | None = None
+        self._link: UdpPorts | None = None
         self._decoder = M1Decoder()
         self._held: list[Chunk] = []
 
@@ -88,7 +88,7 @@ class RobosenseDriver:
         """Open the ports and wait for the first measurement packet. Raises DeviceError with what to check."""
         config = self._config
         self.close()
-        self._link = link = UdpLink(config.address, (config.msop_port, config.difop_port))
+        self._link = link = self.links.udp(config.address, (config.msop_port, config.difop_port))
         self._decoder = M1Decoder(config.min_range_m, config.max_range_m, config.keep_invalid)
         self._garbage = GarbageWatch(self._decoder)
         self._losses = _LossWatch(self._decoder, link)
@@ -106,21 +106,21 @@ class RobosenseDriver:
         else:
             self._decoder.feed(difop.data)
 
-    def _wait_for(self, link: UdpLink, wanted: Callable[[bytes], bool], timeout_s: float) -> Chunk | None:
+    def _wait_for(self, link: UdpPorts, wanted: Callable[[bytes], bool], timeout_s: float) -> Chunk | None:
         """Hold what comes until something wanted is among it; None after `timeout_s`."""
-        deadline_s = time.monotonic() + timeout_s
+        deadline_ns = self.links.monotonic_ns() + int(timeout_s * 1e9)
         looked_at = 0
         while True:
             for chunk in self._held[looked_at:]:
                 if wanted(chunk.data):
                     return chunk
             looked_at = len(self._held)
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or looked_at >= HELD_DATAGRAMS:
+            left_ns = deadline_ns - self.links.monotonic_ns()
+            if left_ns <= 0 or looked_at >= HELD_DATAGRAMS:
                 return None
-            self._held += link.read(left_s)
+            self._held += link.read(left_ns / 1e9)
 
-    def _no_packet(self, link: UdpLink) -> str:
+    def _no_packet(self, link: UdpPorts) -> str:
         config = self._config
         advice = "the lidar's destination address must be this host's, and no firewall may stand between"
         difop = next((chunk.data for chunk in self._held if is_difop(chunk.data)), None)
@@ -140,10 +140,10 @@ class RobosenseDriver:
         assert link is not None
         yield Received(events=tuple(self._connect_events))
         yield from self._backlog(link)
-        last_packet_ns = time.monotonic_ns()
+        last_packet_ns = self.links.monotonic_ns()
         while not stop.is_set():
             chunks = link.read(0.1)
-            now_ns = time.monotonic_ns()
+            now_ns = self.links.monotonic_ns()
             received = self._take(chunks, now_ns)
             if received.chunks or received.events:
                 yield received
@@ -152,24 +152,24 @@ class RobosenseDriver:
             elif now_ns - last_packet_ns > SILENCE_S * 1e9:
                 break
             if 0 < len(chunks) < BATCH_DATAGRAMS:
-                time.sleep(COLLECT_S)
+                self.links.sleep(COLLECT_S)
         yield Received(
             samples=tuple((self._last_arrival_ns, scan) for scan in self._decoder.finish()),
-            events=self._losses.events(time.monotonic_ns()),
+            events=self._losses.events(self.links.monotonic_ns()),
         )
         if not stop.is_set():
             raise DeviceError(f"{self._config.address}: no measurement packet for {SILENCE_S:.0f} s")
 
-    def _backlog(self, link: UdpLink) -> Iterator[Received]:
+    def _backlog(self, link: UdpPorts) -> Iterator[Received]:
         """What came between connecting and now; nothing if the socket's buffer overflowed while nobody read it."""
         chunks, self._held = self._held, []
         while len(chunks) < HELD_DATAGRAMS and (more := link.read(0.0)):
             chunks += more
-        self._last_arrival_ns = time.monotonic_ns()
+        self._last_arrival_ns = self.links.monotonic_ns()
         if self._losses.forgive_kernel_drops():
             return
         for first in range(0, len(chunks), BATCH_DATAGRAMS):
-            yield self._take(chunks[first : first + BATCH_DATAGRAMS], time.monotonic_ns())
+            yield self._take(chunks[first : first + BATCH_DATAGRAMS], self.links.monotonic_ns())
 
     def _take(self, chunks: list[Chunk], now_ns: int) -> Received:
         """Decode a batch: first its clock pairs, so that its frames can be placed in time."""
@@ -204,7 +204,7 @@ class _LossWatch:
     reported as drops, and only what is missing beyond them as a gap, so that the sum of both is what was lost.
     """
 
-    def __init__(self, decoder: M1Decoder, link: UdpLink) -> None:
+    def __init__(self, decoder: M1Decoder, link: UdpPorts) -> None:
         self._decoder = decoder
         self._link = link
         self._lost = self._restarts = self._kernel_drops = self._foreign = 0
@@ -253,7 +253,7 @@ class _Burst:
         return quiet_ns >= BURST_QUIET_NS
 
 
-def _buffer_advice(link: UdpLink, first: Chunk) -> list[DeviceEvent]:
+def _buffer_advice(link: UdpPorts, first: Chunk) -> list[DeviceEvent]:
     """A warning when the socket's buffer cannot hold a second of data."""
     is_dual = first.data[8] == DUAL_RETURN
     needed = M1.packets_per_frame * (2 if is_dual else 1) * 1_000_000 // M1.frame_us * PACKET_SOCKET_BYTES

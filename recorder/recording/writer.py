@@ -66,8 +66,9 @@ class RecordingWriter:
         lidar: bool,
         raw: bool,
         on_error: OnError,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Create all files in an existing, empty folder."""
+        """Create all files in an existing, empty folder. monotonic_ns: the clock that stamps events."""
         self._faults: list[str] = []
 
         def failed(name: str, error: Exception) -> None:
@@ -80,7 +81,7 @@ class RecordingWriter:
         write_manifest(folder, manifest)
         if calibration is not None:
             write_atomically(folder / CALIBRATION_NAME, calibration)
-        self.events = EventLog(folder / EVENTS_NAME, start_ns)
+        self.events = EventLog(folder / EVENTS_NAME, start_ns, monotonic_ns)
         self.raw = RawWriter(folder, manifest.utc_at_time_0.utc_ns - start_ns, failed, tape=raw)
         self._lines = LineWriter(folder, failed)
         self._scans = ScanWriter(folder, failed) if lidar else None

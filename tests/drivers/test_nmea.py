@@ -15,8 +15,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from drivers import links
 from drivers.device import DeviceError
-from drivers.gnss import nmea
 from drivers.gnss.nmea import DRIVER, NmeaConfig, NmeaDriver
 from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, NmeaDecoder
 from drivers.samples import Chunk, FixSample, Received
@@ -381,7 +381,7 @@ class ScriptedLink:
 def scripted(
     monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], rate_hz: float = 10
 ) -> Iterator[Received]:
-    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", rate_hz)
     driver.connect()
     assert [(stream.kind, stream.rate_hz) for stream in driver.streams] == [("gnss", rate_hz)]
@@ -421,7 +421,7 @@ def test_silence_is_a_device_error(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_warnings_and_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     noise = [(i * 500, b"\xfe\x80") for i in range(12)]
-    monkeypatch.setattr(nmea.time, "time_ns", lambda: utc_ns(NOON))
+    monkeypatch.setattr(links.time, "time_ns", lambda: utc_ns(NOON))
     old = gga() + rmc(date="080407")
     reads = [*noise, (6000, old), (6040, b""), (6100, b"\x80" * 5), (7200, b"")]
     reading = scripted(monkeypatch, reads)

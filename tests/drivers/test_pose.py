@@ -122,7 +122,7 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
             super().__init__(address, ports)
             net.at_connect()
 
-    monkeypatch.setattr(pose, "UdpLink", SendsWhenBound)
+    monkeypatch.setattr(links, "UdpLink", SendsWhenBound)
     monkeypatch.setattr(pose, "FIRST_POSE_S", 0.1)
     return net
 

@@ -341,7 +341,7 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
             super().__init__(address, ports)
             net.at_connect()
 
-    monkeypatch.setattr(robosense, "UdpLink", SendsWhenBound)
+    monkeypatch.setattr(links, "UdpLink", SendsWhenBound)
     monkeypatch.setattr(robosense, "FIRST_PACKET_S", 0.1)
     monkeypatch.setattr(robosense, "DIFOP_PERIOD_S", 0.1)
     return net

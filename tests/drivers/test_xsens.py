@@ -13,6 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from drivers import links
 from drivers.device import DeviceError
 from drivers.imu import xsens
 from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder, XbusFramer, decode_mtdata2, mtdata2_items
@@ -440,7 +441,7 @@ class ScriptedLink:
 
 
 def scripted(monkeypatch: pytest.MonkeyPatch, reads: list[tuple[float, bytes]]) -> Iterator[Received]:
-    monkeypatch.setattr(xsens, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", configure=False)
     driver.connect()
     return driver.read(Event())
