@@ -192,7 +192,7 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: flo
         if length > 0:
             height = low_y - slope_hull * low_x
             unsteady = min(4 * float(np.median(height) - height.min()) / spread, 1.0)
-            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-2 * minutes))
+            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-4 * minutes))
             sd_hull = 2.5 / (1 + minutes) * doubt * spread / span * (1 + span / (2 * length))
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
