@@ -6,12 +6,15 @@ instant of a sample plus the transport delay gives when its message is due; `Pac
 
 from __future__ import annotations
 
+import copy
 import ctypes
+import fcntl
 import heapq
 import math
 import os
 import select
 import signal
+import struct
 import time
 import tty
 import zlib
@@ -37,9 +40,12 @@ START_RANGE_NS = (60 * SECOND_NS, 300_000 * SECOND_NS)
 UART_BITS_PER_BYTE = 10
 UART_CHUNK_BYTES = 64
 WORLD_START_DELAY_NS = SECOND_NS
+BACKLOG_NS = SECOND_NS
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
+_TCGETS2 = 0x802C542A
+_TERMIOS2 = struct.Struct("@IIIIB19sII")
 
 
 def random_for(seed: int, *names: str) -> np.random.Generator:
@@ -61,14 +67,14 @@ class DeviceClock:
         drawn_start_ns = int(generator.integers(*START_RANGE_NS))
         self.skew_ppm = float(generator.uniform(-skew_bound_ppm, skew_bound_ppm))
         self.start_ns = drawn_start_ns if start_ns is None else start_ns
-        self._epoch_ns = epoch_ns
+        self.epoch_ns = epoch_ns
         self._phase = float(generator.uniform(0.0, 2 * math.pi))
         self._frequency_per_ns = 2 * math.pi / (DRIFT_PERIOD_S * 1e9)
         self._swing_ns = DRIFT_PPM * 1e-6 / self._frequency_per_ns
 
     def device_ns(self, host_ns: Nanoseconds) -> Nanoseconds:
         """What the clock shows at a host time."""
-        elapsed_ns = host_ns - self._epoch_ns
+        elapsed_ns = host_ns - self.epoch_ns
         return elapsed_ns + self._gained_ns(elapsed_ns) + self.start_ns
 
     def host_ns(self, device_ns: Nanoseconds) -> Nanoseconds:
@@ -77,7 +83,13 @@ class DeviceClock:
         elapsed_ns = shown_ns
         for _ in range(5):  # each round shrinks the error by the skew, 1e-4 or less
             elapsed_ns = shown_ns - self._gained_ns(elapsed_ns)
-        return elapsed_ns + self._epoch_ns
+        return elapsed_ns + self.epoch_ns
+
+    def restarted(self, epoch_ns: int) -> DeviceClock:
+        """The same crystal, counting from zero at a host time."""
+        clock = copy.copy(self)
+        clock.start_ns, clock.epoch_ns = 0, epoch_ns
+        return clock
 
     def _gained_ns(self, elapsed_ns: Nanoseconds) -> Nanoseconds:
         if isinstance(elapsed_ns, int):
@@ -164,22 +176,29 @@ class Pacer:
 class UartTransmitter:
     """The sending side of a serial line: bytes leave at the baud rate and become readable in chunks.
 
-    Messages queue by their release time; a chunk of up to 64 bytes is readable when its last bit is through.
+    Messages queue by their release time; a chunk of up to 64 bytes is readable when its last bit is through. A message
+    for which the line would be a second behind is lost, as in a device's own buffer: `overrun_bytes` counts those.
     """
 
     def __init__(self, baud: int) -> None:
-        self._byte_ns = UART_BITS_PER_BYTE * 1e9 / baud
+        self.overrun_bytes = 0
+        self.baud = baud
         self._waiting: list[tuple[int, int, bytes]] = []
+        self._waiting_bytes = 0
         self._pushed = 0
         self._chunks: deque[tuple[int, bytes]] = deque()
         self._free_ns = 0
 
     def transmission_ns(self, count: int) -> int:
         """How long `count` bytes take."""
-        return round(count * self._byte_ns)
+        return round(count * UART_BITS_PER_BYTE * SECOND_NS / self.baud)
 
     def push(self, release_ns: int, data: bytes) -> None:
         """Hand over a message that may start at `release_ns`, when the line is free by then."""
+        if self._free_ns + self.transmission_ns(self._waiting_bytes) > release_ns + BACKLOG_NS:
+            self.overrun_bytes += len(data)
+            return
+        self._waiting_bytes += len(data)
         heapq.heappush(self._waiting, (release_ns, self._pushed, data))
         self._pushed += 1
 
@@ -187,6 +206,7 @@ class UartTransmitter:
         """Take back the messages that have not started."""
         dropped = [data for _, _, data in self._waiting]
         self._waiting.clear()
+        self._waiting_bytes = 0
         return dropped
 
     def next_due_ns(self) -> int | None:
@@ -209,6 +229,7 @@ class UartTransmitter:
 
     def _start_message(self) -> None:
         release_ns, _, data = heapq.heappop(self._waiting)
+        self._waiting_bytes -= len(data)
         start_ns = max(release_ns, self._free_ns)
         for begin in range(0, len(data), UART_CHUNK_BYTES):
             end = min(begin + UART_CHUNK_BYTES, len(data))
@@ -224,20 +245,44 @@ class Pty:
 
     def __init__(self, link: Path) -> None:
         """Open it raw, under the stable name `link`."""
-        self.fd, slave = os.openpty()
         self.path = link
         self.unheard_bytes = 0
         self.lost_bytes = 0
+        self.is_plugged = False
+        self._open()
+        self.replug()
+
+    def _open(self) -> None:
+        self.fd, slave = os.openpty()
         tty.setraw(slave)
-        link.symlink_to(os.ttyname(slave))
+        self._terminal = os.ttyname(slave)
         os.close(slave)  # from here on a hang-up tells that the other side is closed
         os.set_blocking(self.fd, False)
         self._poll = select.poll()
         self._poll.register(self.fd, 0)
 
+    def unplug(self) -> None:
+        """Hang up, and take the name away; there is another terminal already, which nobody can know."""
+        gone = self.fd
+        self.is_plugged = False
+        self.path.unlink(missing_ok=True)
+        self._open()
+        os.close(gone)
+
+    def replug(self) -> None:
+        """Let the name lead to the terminal."""
+        self.is_plugged = True
+        self.path.symlink_to(self._terminal)
+
     def is_open(self) -> bool:
         """Whether the other side is open."""
-        return not self._poll.poll(0)
+        return self.is_plugged and not self._poll.poll(0)
+
+    def baud(self) -> int:
+        """The speed the other side has set."""
+        settings = fcntl.ioctl(self.fd, _TCGETS2, bytes(_TERMIOS2.size))
+        speed: int = _TERMIOS2.unpack(settings)[-1]
+        return speed
 
     def send(self, data: bytes) -> None:
         """Make bytes readable, or lose them."""
