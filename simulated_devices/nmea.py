@@ -10,16 +10,17 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from simulated_devices.faults import NO_FAULTS, FaultSettings
+from simulated_devices.imu import checked_rate
+from simulated_devices.links import SerialLine
+from simulated_devices.sampling import SampleGrid
 from simulated_devices.timing import (
     MILLISECOND_NS,
     SECOND_NS,
     UART_CHUNK_BYTES,
     DelayModel,
     Opened,
-    Pacer,
-    Pty,
     Stage,
-    UartTransmitter,
     random_for,
 )
 from simulated_devices.world import FloatArray, GeodeticOrigin, Trajectory
@@ -28,6 +29,7 @@ ORIGIN = GeodeticOrigin(60.1738, 24.9065, 14.19, 17.8)
 RATES_HZ = (1, 2, 4, 5, 10, 20)
 UTC_OFFSET_NS = 100 * MILLISECOND_NS
 SIGMA_M = (0.010, 0.012, 0.020)  # north, east, up: what GST states and what the noise is
+DAY_NS = 86_400 * SECOND_NS
 KNOT_M_S = 1852.0 / 3600.0
 
 DELAY = DelayModel(
@@ -100,59 +102,57 @@ def epoch_sentences(fix: Fix) -> list[bytes]:
 class NmeaSimulator:
     """The receiver on its pty: an epoch at each step of its UTC, sent some time later at the baud rate."""
 
-    _pty: Pty
-
-    def __init__(self, name: str, settings: NmeaSettings, stage: Stage, trajectory: Trajectory) -> None:
-        if settings.rate_hz not in RATES_HZ:
-            raise ValueError(f"devices.{name}.rate_hz: {settings.rate_hz} is none of {', '.join(map(str, RATES_HZ))}")
+    def __init__(
+        self,
+        name: str,
+        settings: NmeaSettings,
+        stage: Stage,
+        trajectory: Trajectory,
+        faults: FaultSettings = NO_FAULTS,
+    ) -> None:
+        checked_rate(name, settings.rate_hz, RATES_HZ)
         self.name = name
         self.opened = Opened()
-        self.pacer = Pacer()
         self._stage = stage
         self._trajectory = trajectory
-        self._period_ns = SECOND_NS // settings.rate_hz
         self._random = random_for(stage.seed, "gnss", name)
         offset_ns = int(self._random.integers(-UTC_OFFSET_NS, UTC_OFFSET_NS))
-        self._clock = stage.clock(settings.clock or name, start_ns=stage.epoch_utc_ns + offset_ns)
+        utc_ns = stage.epoch_utc_ns + offset_ns
+        if faults.wrap_in_s is not None:
+            utc_ns = (utc_ns // DAY_NS + 1) * DAY_NS - round(faults.wrap_in_s * SECOND_NS)
+        clock = stage.clock(settings.clock or name, start_ns=utc_ns)
+        self._line = SerialLine(name, settings.baud, stage, faults)
+        period_ns = SECOND_NS // settings.rate_hz
+        self._grid = SampleGrid(clock, period_ns, self._line.schedule.power_cut, keeps_time=True)
         self._delay = stage.delay(name, DELAY)
-        self._uart = UartTransmitter(settings.baud)
 
     def open(self, folder: Path) -> dict[str, object]:
         """Make the pty; give the keys a recorder needs."""
-        self._pty = Pty(folder / self.name)
-        latency_ns = DELAY.floor_ns + self._uart.transmission_ns(UART_CHUNK_BYTES)
-        return {"port": str(self._pty.path), "latency_s": round(latency_ns * 1e-9, 6)}
+        path = self._line.open(folder)
+        latency_ns = DELAY.floor_ns + self._line.transmission_ns(UART_CHUNK_BYTES)
+        return {"port": str(path), "latency_s": round(latency_ns * 1e-9, 6)}
 
     def close(self) -> None:
         """Close the pty."""
-        self._pty.close()
+        self._line.close()
 
     def summary(self) -> str:
         """What was sent, and what was lost."""
-        return f"{self.pacer.summary()}, {self._pty.lost_bytes} bytes lost, {self._pty.unheard_bytes} unheard"
+        return self._line.summary()
 
     def run(self) -> None:
         """Send fixes for ever."""
-        epoch = self._clock.device_ns(time.monotonic_ns()) // self._period_ns + 1
+        self._grid.start(time.monotonic_ns(), ahead=1)
         while True:
-            host_ns = self._clock.host_ns(epoch * self._period_ns)
-            while time.monotonic_ns() < host_ns - _LOOKAHEAD_NS:
-                self._send_due()
-            release_ns = int(self._delay.release_ns(np.array([host_ns]))[0])
-            self._uart.push(release_ns, b"".join(epoch_sentences(self._fix(epoch * self._period_ns, host_ns))))
-            epoch += 1
-
-    def _send_due(self) -> None:
-        """Wait for the next chunk, or a little, and send what is due."""
-        due_ns = self._uart.next_due_ns()
-        soon_ns = time.monotonic_ns() + 10 * MILLISECOND_NS
-        self._pty.wait_until(soon_ns if due_ns is None else min(due_ns, soon_ns))
-        for chunk_due_ns, chunk in self._uart.pop_due(time.monotonic_ns()):
-            self._pty.send(chunk)
-            self.pacer.done(chunk_due_ns)
-        self._pty.receive()  # commands are read and not followed
-        if not self.opened and self._pty.is_open():
-            self.opened.set()
+            while time.monotonic_ns() < self._grid.next_host_ns() - _LOOKAHEAD_NS:
+                self._line.exchange()  # commands are read and not followed
+                if not self.opened and self._line.is_open():
+                    self.opened.set()
+            instants = self._grid.take(1)
+            utc_ns, host_ns = int(instants.device_ns[0]), int(instants.host_ns[0])
+            release_ns = int(self._delay.release_ns(instants.host_ns)[0])
+            for line in epoch_sentences(self._fix(utc_ns, host_ns)):
+                self._line.push(release_ns, line)
 
     def _fix(self, utc_ns: int, host_ns: int) -> Fix:
         kinematics = self._trajectory.kinematics(self._stage.world_s(np.array([host_ns])))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-import socket
 import time
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from simulated_devices.faults import NO_FAULTS, FaultSettings
+from simulated_devices.imu import wrapping_clock
+from simulated_devices.links import DatagramSender
+from simulated_devices.sampling import SampleGrid
 from simulated_devices.timing import MILLISECOND_NS, DelayModel, Pacer, Stage
 from simulated_devices.world import FloatArray, Trajectory
 
@@ -60,7 +63,14 @@ class PoseSimulator:
 
     opened = None  # nobody connects to a source of datagrams
 
-    def __init__(self, name: str, settings: PoseSettings, stage: Stage, trajectory: Trajectory) -> None:
+    def __init__(
+        self,
+        name: str,
+        settings: PoseSettings,
+        stage: Stage,
+        trajectory: Trajectory,
+        faults: FaultSettings = NO_FAULTS,
+    ) -> None:
         if not 0 < settings.rate_hz <= 1000:
             raise ValueError(f"devices.{name}.rate_hz: {settings.rate_hz} is not above 0 and up to 1000")
         self.name = name
@@ -68,8 +78,9 @@ class PoseSimulator:
         self._stage = stage
         self._trajectory = trajectory
         self._port = settings.port
-        self._period_us = 1e6 / settings.rate_hz
-        self._clock = stage.clock(settings.clock or name)
+        self._sender = DatagramSender(name, stage, faults)
+        clock = wrapping_clock(name, settings.clock, stage, faults, None)
+        self._grid = SampleGrid(clock, 1e9 / settings.rate_hz, self._sender.schedule.power_cut)
         self._delay = stage.delay(name, DELAY)
 
     def open(self, folder: Path) -> dict[str, object]:
@@ -85,14 +96,16 @@ class PoseSimulator:
 
     def run(self) -> None:
         """Send poses for ever."""
-        first = int(self._clock.device_ns(time.monotonic_ns()) / 1000 / self._period_us) + 2
-        sequence = 0
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        self._grid.start(time.monotonic_ns())
+        power_ups = sequence = 0
+        with self._sender as sender:
             while True:
-                times_us = np.rint((first + sequence + np.arange(_BATCH)) * self._period_us).astype(np.int64)
-                host_ns = self._clock.host_ns(times_us * 1000)
-                rotation, position_m = self._trajectory.pose(self._stage.world_s(host_ns))
-                for index, release_ns in enumerate(self._delay.release_ns(host_ns).tolist()):
+                instants = self._grid.take(_BATCH)
+                if self._grid.power_ups != power_ups:
+                    power_ups, sequence = self._grid.power_ups, 0
+                times_us = np.rint(instants.device_ns / 1000).astype(np.int64)
+                rotation, position_m = self._trajectory.pose(self._stage.world_s(instants.host_ns))
+                for index, release_ns in enumerate(self._delay.release_ns(instants.host_ns).tolist()):
                     message = pose_message(sequence, int(times_us[index]), rotation[index], position_m[index])
                     self.pacer.wait_until(release_ns)
                     sender.sendto(message, (HOST, self._port))

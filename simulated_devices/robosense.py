@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -14,6 +13,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from simulated_devices.faults import NO_FAULTS, FaultSettings
+from simulated_devices.imu import wrapping_clock
+from simulated_devices.links import DatagramSender
+from simulated_devices.sampling import SampleGrid
 from simulated_devices.scene import M1_BLOCKS, M1_CHANNELS, M1_PACKETS, M1Scanner, Room
 from simulated_devices.timing import MILLISECOND_NS, SECOND_NS, DelayModel, Int64Array, Pacer, Stage
 from simulated_devices.world import FloatArray, Trajectory
@@ -160,7 +163,13 @@ class RobosenseSimulator:
     opened = None  # nobody connects to a source of datagrams
 
     def __init__(
-        self, name: str, settings: RobosenseSettings, stage: Stage, trajectory: Trajectory, room: Room
+        self,
+        name: str,
+        settings: RobosenseSettings,
+        stage: Stage,
+        trajectory: Trajectory,
+        room: Room,
+        faults: FaultSettings = NO_FAULTS,
     ) -> None:
         self.name = name
         self.pacer = Pacer()
@@ -168,7 +177,9 @@ class RobosenseSimulator:
         self._stage = stage
         self._trajectory = trajectory
         self._room = room
-        self._clock = stage.clock(settings.clock or name)
+        self._sender = DatagramSender(name, stage, faults)
+        clock = wrapping_clock(name, settings.clock, stage, faults, None)
+        self._grid = SampleGrid(clock, FRAME_NS, self._sender.schedule.power_cut)
         self._delay = stage.delay(name, DELAY)
         self._serial_number = stage.seed_for("serial number", name).to_bytes(6, "big")
         self._scanner = M1Scanner(stage.seed_for("lidar", name))
@@ -196,26 +207,28 @@ class RobosenseSimulator:
     def run(self) -> None:
         """Send frames for ever."""
         threading.Thread(target=self._build, name=f"{self.name} frames", daemon=True).start()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        with self._sender as sender:
             while True:
                 self._send(sender, self._ready.get())
 
     def _build(self) -> None:
-        for frame in self._frames(self._clock.device_ns(time.monotonic_ns()) // FRAME_NS + 2):
+        self._grid.start(time.monotonic_ns())
+        for frame in self._frames():
             self._ready.put(frame)
 
-    def _frames(self, index: int) -> Iterator[_Frame]:
+    def _frames(self) -> Iterator[_Frame]:
         while True:
-            start_ns = index * FRAME_NS
-            packet_ns = start_ns + self._offset_ns
-            host_ns = self._clock.host_ns(packet_ns)
+            instants = self._grid.take(1)
+            packet_ns = instants.device_ns + self._offset_ns
+            host_ns = self._grid.clock.host_ns(packet_ns)
             start_s = float(self._stage.world_s(host_ns[:1])[0])
-            radius, intensity = self._scanner.scan(self._room, self._trajectory, start_s, IMU_FROM_LIDAR, index)
+            radius, intensity = self._scanner.scan(
+                self._room, self._trajectory, start_s, IMU_FROM_LIDAR, int(instants.numbers[0])
+            )
             packets = self._encoder.frame(np.rint(packet_ns / 1000).astype(np.int64), radius, intensity)
             yield _Frame(self._delay.release_ns(host_ns), memoryview(packets.tobytes()))
-            index += 1
 
-    def _send(self, sender: socket.socket, frame: _Frame) -> None:
+    def _send(self, sender: DatagramSender, frame: _Frame) -> None:
         """Send the packets of a frame as they fall due, about every millisecond."""
         target = (HOST, self._settings.msop_port)
         due_ns = frame.due_ns.tolist()
@@ -230,8 +243,8 @@ class RobosenseSimulator:
             if now_ns >= self._next_difop_ns:
                 self._send_difop(sender, now_ns)
 
-    def _send_difop(self, sender: socket.socket, now_ns: int) -> None:
+    def _send_difop(self, sender: DatagramSender, now_ns: int) -> None:
         msop_port, difop_port = self._settings.msop_port, self._settings.difop_port
-        time_us = self._clock.device_ns(now_ns) // 1000
+        time_us = self._grid.clock.device_ns(now_ns) // 1000
         sender.sendto(encode_difop(time_us, self._serial_number, msop_port, difop_port), (HOST, difop_port))
         self._next_difop_ns = now_ns + SECOND_NS

@@ -4,7 +4,8 @@ import struct
 
 import pytest
 
-from simulated_devices.xsens import Reading, XbusDevice, encode_values, shortest_message_bytes, xbus_message
+from simulated_devices.imu import Reading
+from simulated_devices.xsens import XbusDevice, encode_values, shortest_message_bytes, xbus_message
 
 TO_CONFIG = bytes.fromhex("FA FF 30 00 D1")
 TO_MEASUREMENT = bytes.fromhex("FA FF 10 00 F1")
@@ -41,7 +42,7 @@ def test_the_worked_example_of_a_real_device():
     device.receive(TO_MEASUREMENT)
     device.packet_counter = 42581
     reading = Reading(
-        5719854,
+        571_985_400_000,
         floats("BDA21AF8 BE2A8E96 411D27A2"),
         floats("BBB17D81 BB963200 3C01E841"),
         [value * 50.0 for value in floats("BE999C24 3FB61B56 3F166AEB")],
