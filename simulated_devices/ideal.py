@@ -22,7 +22,7 @@ from recorder.recording.writer import RecordingWriter, new_manifest
 from simulated_devices.camera import ClientStream, PictureEncoder
 from simulated_devices.nmea import ORIGIN, SIGMA_M
 from simulated_devices.pose import quaternion
-from simulated_devices.rig import Cast, calibration, simulate_settings
+from simulated_devices.rig import IMUS, Cast, calibration, simulate_settings
 from simulated_devices.robosense import IMU_FROM_LIDAR
 from simulated_devices.scene import CameraRenderer, M1Scanner, PinholeCamera
 from simulated_devices.timing import SECOND_NS, random_for
@@ -54,7 +54,7 @@ class Twin:
         self.cameras = [name for name, entry in entries.items() if entry["driver"] == "stream"]
         self.calibration = calibration(self._cast.cameras)
         makers = {
-            "xsens": self._imu,
+            **dict.fromkeys(IMUS, self._imu),
             "nmea": self._gnss,
             "robosense": self._lidar,
             "stream": self._camera,

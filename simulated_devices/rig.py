@@ -14,7 +14,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from multiprocessing import connection, get_context
 from multiprocessing.process import BaseProcess
@@ -27,14 +27,21 @@ import yaml
 
 from recorder.errors import ConfigError
 from recorder.rig import DEVICE_NAME, apply_settings
+from simulated_devices.ascii_imu import AsciiImuSettings, ascii_imu_simulator
+from simulated_devices.bno08x_rvc import Bno08xRvcSettings, bno08x_rvc_simulator
 from simulated_devices.camera import CameraSettings, CameraSimulator
+from simulated_devices.faults import NO_FAULTS, FaultSettings
+from simulated_devices.imu import ImuSimulator
+from simulated_devices.microstrain import MicrostrainSettings, microstrain_simulator
 from simulated_devices.nmea import NmeaSettings, NmeaSimulator
 from simulated_devices.pose import PoseSettings, PoseSimulator
 from simulated_devices.robosense import RobosenseSettings, RobosenseSimulator
 from simulated_devices.scene import PinholeCamera, Room, stereo_pair
 from simulated_devices.timing import SECOND_NS, Opened, Stage, die_with_parent, wake_precisely
+from simulated_devices.vectornav import VectornavSettings, vectornav_simulator
+from simulated_devices.witmotion import WitmotionSettings, witmotion_simulator
 from simulated_devices.world import Trajectory
-from simulated_devices.xsens import XsensSettings, XsensSimulator
+from simulated_devices.xsens import XsensSettings, xsens_simulator
 
 log = logging.getLogger(__name__)
 
@@ -44,18 +51,30 @@ _EXIT_S = 0.5
 _ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 Settings = TypeVar("Settings", bound=msgspec.Struct)
+MakeImu = Callable[[str, Any, Stage, Trajectory, FaultSettings], ImuSimulator]
+
+IMUS: dict[str, tuple[type[msgspec.Struct], MakeImu]] = {
+    "xsens": (XsensSettings, xsens_simulator),
+    "vectornav": (VectornavSettings, vectornav_simulator),
+    "microstrain": (MicrostrainSettings, microstrain_simulator),
+    "witmotion": (WitmotionSettings, witmotion_simulator),
+    "ascii-imu": (AsciiImuSettings, ascii_imu_simulator),
+    "bno08x-rvc": (Bno08xRvcSettings, bno08x_rvc_simulator),
+}
 
 
 class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The `simulate` keys of a rig.
 
     jitter: factor on all transport jitter and bursts. skew_ppm: bound of the skew each clock draws.
+    faults: what goes wrong with each device, by its name.
     """
 
     trajectory: str = "gentle"
     seed: int = 1
     jitter: float = 1.0
     skew_ppm: float = 50.0
+    faults: dict[str, FaultSettings] = {}
 
 
 class SimulatedDevice(Protocol):
@@ -195,8 +214,9 @@ class Cast:
         self.stage = Stage(settings.seed, settings.jitter, settings.skew_ppm)
         self.cameras: list[PinholeCamera] = []
         self.ports = UdpPorts()
+        self._faults = settings.faults
         self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
-            "xsens": self._xsens,
+            **dict.fromkeys(IMUS, self._imu),
             "nmea": self._nmea,
             "robosense": self._robosense,
             "stream": self._stream,
@@ -218,22 +238,33 @@ class Cast:
         except ValueError as error:  # its message begins with the key path
             raise ConfigError(str(error)) from error
 
-    def _xsens(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
-        settings = _baud_checked(name, _convert(entry, XsensSettings, f"devices.{name}"))
-        return XsensSimulator(name, settings, self.stage, self.trajectory)
+    def faults(self, name: str, *, is_serial: bool) -> FaultSettings:
+        """What goes wrong with a device. Raises ValueError with the key path."""
+        faults = self._faults.get(name, NO_FAULTS)
+        if not is_serial and faults.wrong_baud is not None:
+            raise ValueError(f"simulate.faults.{name}.wrong_baud: this device is not on a serial line")
+        return faults
+
+    def _imu(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        kind, make = IMUS[entry["driver"]]
+        settings = _baud_checked(name, _convert(entry, kind, f"devices.{name}"))
+        return make(name, settings, self.stage, self.trajectory, self.faults(name, is_serial=True))
 
     def _nmea(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _baud_checked(name, _convert(entry, NmeaSettings, f"devices.{name}"))
-        return NmeaSimulator(name, settings, self.stage, self.trajectory)
+        return NmeaSimulator(name, settings, self.stage, self.trajectory, self.faults(name, is_serial=True))
 
     def _robosense(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = self._with_ports(
             name, _convert(entry, RobosenseSettings, f"devices.{name}"), ("msop_port", "difop_port")
         )
-        return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room)
+        faults = self.faults(name, is_serial=False)
+        return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room, faults)
 
     def _stream(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, CameraSettings, f"devices.{name}")
+        if name in self._faults:
+            raise ValueError(f"simulate.faults.{name}: a simulated camera has no faults")
         if len(self.cameras) == 2:
             raise ValueError(f"devices.{name}: a simulated rig has at most two cameras")
         for key in ("width", "height"):
@@ -245,7 +276,7 @@ class Cast:
 
     def _pose(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = self._with_ports(name, _convert(entry, PoseSettings, f"devices.{name}"), ("port",))
-        return PoseSimulator(name, settings, self.stage, self.trajectory)
+        return PoseSimulator(name, settings, self.stage, self.trajectory, self.faults(name, is_serial=False))
 
     def _with_ports(self, name: str, settings: Settings, keys: tuple[str, ...]) -> Settings:
         ports = {key: self.ports.take(f"devices.{name}.{key}", getattr(settings, key)) for key in keys}
@@ -263,7 +294,11 @@ class Simulation:
         entries = source.get("devices")
         if not isinstance(entries, dict) or not entries:
             raise ConfigError("devices: a mapping of at least one device is needed")
-        cast = Cast(simulate_settings(source))
+        settings = simulate_settings(source)
+        for name in settings.faults:
+            if name not in entries:
+                raise ConfigError(f"simulate.faults.{name}: no such device; there are: {', '.join(map(str, entries))}")
+        cast = Cast(settings)
         try:
             self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]
         except ConfigError:
@@ -327,9 +362,9 @@ class Simulation:
         signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)  # until each child has handlers of its own
         try:
             for device in self._devices:
-                process = context.Process(
-                    target=_device_process, args=(device, os.getpid(), self._report), name=device.name, daemon=True
-                )
+                others = [other for other in self._devices if other is not device]
+                arguments = (device, others, os.getpid(), self._report)
+                process = context.Process(target=_device_process, args=arguments, name=device.name, daemon=True)
                 process.start()
                 self._processes[device.name] = process
         finally:
@@ -352,7 +387,7 @@ class Simulation:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
 
 
-def _device_process(device: SimulatedDevice, parent: int, report: bool) -> None:
+def _device_process(device: SimulatedDevice, others: Sequence[SimulatedDevice], parent: int, report: bool) -> None:
     """What runs in a device's process."""
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -367,6 +402,8 @@ def _device_process(device: SimulatedDevice, parent: int, report: bool) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
     die_with_parent()
     wake_precisely()
+    for other in others:  # a terminal hangs up when the last process lets go of it
+        other.close()
     if os.getppid() == parent:
         device.run()
 
