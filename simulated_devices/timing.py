@@ -195,7 +195,8 @@ class UartTransmitter:
 
     def push(self, release_ns: int, data: bytes) -> None:
         """Hand over a message that may start at `release_ns`, when the line is free by then."""
-        if self._free_ns + self.transmission_ns(self._waiting_bytes) > release_ns + BACKLOG_NS:
+        begin_ns = max(self._free_ns, self._waiting[0][0]) if self._waiting else self._free_ns
+        if begin_ns + self.transmission_ns(self._waiting_bytes) > release_ns + BACKLOG_NS:
             self.overrun_bytes += len(data)
             return
         self._waiting_bytes += len(data)
