@@ -17,6 +17,7 @@ import click
 from rich.console import Console
 from rich.progress import Progress
 
+from recorder import devices as attached
 from recorder import simulation
 from recorder.decode import decode as decode_capture
 from recorder.errors import ConfigError, RecorderError
@@ -138,6 +139,27 @@ def _stop_on_signals(console: Console) -> threading.Event:
     signal.signal(signal.SIGINT, on_signal)
     signal.signal(signal.SIGTERM, on_signal)
     return stop
+
+
+@main.command()
+@click.option("--network", is_flag=True, help="Listen on all interfaces, not on loopback only.")
+@click.option("--probe", is_flag=True, help="Open serial ports and recognise what speaks on them.")
+@click.option("--port", "ports", multiple=True, metavar="PATH", help="One more serial port (repeatable).")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.pass_obj
+def devices(verbose: bool, network: bool, probe: bool, ports: tuple[str, ...], as_json: bool) -> None:
+    """List what is attached, as a rig.yaml that `record` takes as it is.
+
+    Lidars are listened for over two seconds. What is not known stands there as a comment.
+
+    \b
+    Examples:
+      rigtape devices --probe --network > rig.yaml
+      rigtape devices --probe --port /dev/pts/3
+    """
+    with clear_errors(verbose):
+        found = attached.find(network=network, probe=probe, extra_ports=ports)
+    click.echo(found.to_json() if as_json else attached.rig_yaml(found), nl=as_json)
 
 
 @main.command()
