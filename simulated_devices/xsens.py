@@ -40,8 +40,8 @@ STATUS_WORD = 0xE020
 QUANTITY_MASK = 0xF8F0
 WITH_EVERY_MESSAGE = 0xFFFF
 
-BASE_RATE_HZ = 400
-RATES_HZ = tuple(rate for rate in range(1, BASE_RATE_HZ + 1) if BASE_RATE_HZ % rate == 0)
+BASE_RATES_HZ = (400, 1000)  # of the usual models, and of the high-rate outputs
+RATES_HZ = tuple(rate for rate in range(1, 1001) if any(base_hz % rate == 0 for base_hz in BASE_RATES_HZ))
 SAMPLE_TIME_HZ = 10_000
 TICK_NS = SECOND_NS // SAMPLE_TIME_HZ
 MAG_UNIT_UT = 50.0  # one arbitrary unit: the field at factory calibration
@@ -89,6 +89,7 @@ class XbusDevice(ImuDevice):
 
     def __init__(self, device_id: int, rate_hz: int) -> None:
         self.packet_counter = 0
+        self._base_rate_hz = base_rate_of(rate_hz)
         self.outputs: list[tuple[int, int]] = [
             (PACKET_COUNTER, WITH_EVERY_MESSAGE),
             (SAMPLE_TIME_FINE, WITH_EVERY_MESSAGE),
@@ -147,13 +148,15 @@ class XbusDevice(ImuDevice):
         """Take the outputs asked for as far as they exist, and echo what holds now; no data only asks."""
         if data:
             asked = struct.iter_unpack(">HH", data)
-            self.outputs = [(item, _allowed_rate(item, rate)) for item, rate in asked if item & QUANTITY_MASK in _ITEMS]
+            self.outputs = [
+                (item, self._allowed_rate(item, rate)) for item, rate in asked if item & QUANTITY_MASK in _ITEMS
+            ]
         echo = b"".join(struct.pack(">HH", item, rate) for item, rate in self.outputs)
         return xbus_message(SET_OUTPUT_CONFIGURATION_ACK, echo)
 
     def message(self, sample_number: int, reading: Reading) -> bytes:
         """See `ImuDevice`: MTData2."""
-        due = [item for item, rate in self.outputs if _is_due(rate, sample_number)]
+        due = [item for item, rate in self.outputs if self._is_due(rate, sample_number)]
         timed = [item for item, rate in self.outputs if rate != WITH_EVERY_MESSAGE]
         if not self.measuring or (timed and not set(due) & set(timed)):
             return b""
@@ -165,6 +168,17 @@ class XbusDevice(ImuDevice):
         """See `ImuDevice`: the counter goes on with the next message that is sent."""
         unsent = sum(message[2] == MT_DATA2 for message in messages)
         self.packet_counter = (self.packet_counter - unsent) & 0xFFFF
+
+    def _allowed_rate(self, item: int, rate_hz: int) -> int:
+        """The nearest rate the device has that is not above the one asked for; 0 turns the output off."""
+        if item & QUANTITY_MASK in _TIME_AND_STATUS:
+            return WITH_EVERY_MESSAGE if rate_hz else 0
+        return max((rate for rate in RATES_HZ if rate <= rate_hz and self._base_rate_hz % rate == 0), default=0)
+
+    def _is_due(self, rate_hz: int, sample_number: int) -> bool:
+        if rate_hz == WITH_EVERY_MESSAGE:
+            return True
+        return rate_hz > 0 and sample_number % (self._base_rate_hz // rate_hz) == 0
 
     def _item(self, item: int, reading: Reading) -> bytes:
         quantity = item & QUANTITY_MASK
@@ -183,24 +197,16 @@ _TIME_AND_STATUS = {PACKET_COUNTER, SAMPLE_TIME_FINE, STATUS_WORD}
 _ITEMS = {*_TIME_AND_STATUS, TEMPERATURE, ACCELERATION, RATE_OF_TURN, MAGNETIC_FIELD}
 
 
+def base_rate_of(rate_hz: int) -> int:
+    """The rate of the samples of a device that is to give `rate_hz`."""
+    return min(base_hz for base_hz in BASE_RATES_HZ if base_hz % rate_hz == 0)
+
+
 def shortest_message_bytes(rate_hz: int) -> int:
     """The size of the shortest measurement with the outputs of power-up."""
     device = XbusDevice(0, rate_hz)
-    messages = (device.message(number, STILL) for number in range(BASE_RATE_HZ))
+    messages = (device.message(number, STILL) for number in range(base_rate_of(rate_hz)))
     return min(len(message) for message in messages if message)
-
-
-def _allowed_rate(item: int, rate_hz: int) -> int:
-    """The nearest rate the device has that is not above the one asked for; 0 turns the output off."""
-    if item & QUANTITY_MASK in _TIME_AND_STATUS:
-        return WITH_EVERY_MESSAGE if rate_hz else 0
-    return max((rate for rate in RATES_HZ if rate <= rate_hz), default=0)
-
-
-def _is_due(rate_hz: int, sample_number: int) -> bool:
-    if rate_hz == WITH_EVERY_MESSAGE:
-        return True
-    return rate_hz > 0 and sample_number % (BASE_RATE_HZ // rate_hz) == 0
 
 
 def _values(quantity: int, reading: Reading) -> Sequence[float]:
@@ -220,7 +226,7 @@ def xsens_simulator(
     rate_hz = checked_rate(name, settings.rate_hz, RATES_HZ)
     device_id = 0x03700000 | stage.seed_for("serial number", name) & 0xFFFF
     protocol = ImuProtocol(
-        base_rate_hz=BASE_RATE_HZ,
+        base_rate_hz=base_rate_of(rate_hz),
         make=lambda: XbusDevice(device_id, rate_hz),
         shortest_bytes=shortest_message_bytes(rate_hz),
         wrap_ns=2**32 * TICK_NS,

@@ -253,7 +253,7 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
                 "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, stream, vectornav, witmotion, xsens",
             ],
         ),
-        ("devices.imu.rate_hz=300", ["devices.imu.rate_hz", "200, 400"]),
+        ("devices.imu.rate_hz=300", ["devices.imu.rate_hz", "200, 250, 400"]),
         ("devices.gnss.baud=fast", ["devices.gnss.baud", "int"]),
         ("devices.left.width=33", ["devices.left.width", "even"]),
         ("devices.mocap.port=70000", ["devices.mocap.port", "65535"]),

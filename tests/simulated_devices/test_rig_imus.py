@@ -1,12 +1,15 @@
 """Simulated IMUs and faults as processes of their own, read through their ptys."""
 
+import json
 import os
 import select
 import signal
+import socket
 import struct
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +42,8 @@ class Ports:
         while (line := self.process.stdout.readline()) not in ("...\n", ""):
             lines.append(line)
         self.devices = yaml.safe_load("".join(lines))["devices"]
-        self.open_ports = {name: self.open(name) for name in self.devices}
+        serial = [name for name, entry in self.devices.items() if "address" not in entry]
+        self.open_ports = {name: self.open(name) for name in serial}
 
     def open(self, name):
         return os.open(self.devices[name]["port"], os.O_RDWR | os.O_NOCTTY)
@@ -71,6 +75,14 @@ class Ports:
         self.process.communicate(timeout=DEADLINE_S)
 
 
+def datagrams(port, count):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        receiver.bind(("127.0.0.1", port))
+        receiver.settimeout(DEADLINE_S)
+        return [receiver.recv(2048) for _ in range(count)]
+
+
 @pytest.fixture(scope="module")
 def imus(tmp_path_factory):
     ports = Ports(tmp_path_factory.mktemp("rig") / "rig.yaml", {"devices": IMUS})
@@ -81,11 +93,19 @@ def imus(tmp_path_factory):
 @pytest.fixture(scope="module")
 def troubled(tmp_path_factory):
     document = {
-        "simulate": {"faults": {"pulled": UNPLUGGED, "reset": RESTARTED, "soon": {"wrap_in_s": 4.0}}},
+        "simulate": {
+            "faults": {
+                "pulled": UNPLUGGED,
+                "reset": RESTARTED,
+                "soon": {"wrap_in_s": 4.0},
+                "midnight": {"wrap_in_s": 3.0, "text_rate": 0.1, "text": "#"},
+            }
+        },
         "devices": {
             "pulled": {"driver": "xsens", "baud": 921600, "rate_hz": 400},
             "reset": {"driver": "ascii-imu", "rate_hz": 200, "columns": ["time", "az"]},
             "soon": {"driver": "ascii-imu", "rate_hz": 200, "columns": ["time", "az"]},
+            "midnight": {"driver": "nmea", "rate_hz": 5},
         },
     }
     ports = Ports(tmp_path_factory.mktemp("rig") / "rig.yaml", document)
@@ -173,6 +193,42 @@ def test_a_counter_wraps_when_it_shall(troubled):
     lines = troubled.until("soon", wrapped).split(b"\r\n")[1:-1]
     times_us = [int(line.split(b",")[0]) for line in lines]
     assert {step % 2**32 for step in np.diff(times_us)} == {5000}
+
+
+def test_a_receiver_passes_midnight_with_text_between_its_sentences(troubled):
+    data = troubled.until("midnight", lambda data: b"ZDA,000000.40" in data)
+    assert b"\r\n#$GN" in data
+    lines = data.replace(b"#", b"").split(b"\r\n")
+    times = [line.split(b",")[1] for line in lines if line.startswith(b"$GNZDA")]
+    days = [int(line.split(b",")[2]) for line in lines if line.startswith(b"$GNZDA")]
+    at = times.index(b"000000.00")
+    assert times[at - 1 : at + 2] == [b"235959.80", b"000000.00", b"000000.20"]
+    assert days[at - 1] != days[at] == days[at + 1]
+
+
+def test_poses_and_lidar_packets_are_lost_and_begin_anew(tmp_path):
+    faults = {"mocap": {"restart_at_s": 0.5, "restart_takes_s": 0.3, "lost_message_rate": 0.2}}
+    document = {
+        "simulate": {"faults": {**faults, "lidar": {"lost_message_rate": 0.01, "unplug_at_s": 0, "own_power": True}}},
+        "devices": {
+            "mocap": {"driver": "pose", "port": 0, "rate_hz": 200},
+            "lidar": {"driver": "robosense", "msop_port": 0, "difop_port": 0},
+        },
+    }
+    ports = Ports(tmp_path / "rig.yaml", document)
+    try:
+        poses = [json.loads(data) for data in datagrams(ports.devices["mocap"]["port"], 400)]
+        steps = np.diff([pose["sequence"] for pose in poses])
+        (restart,) = np.flatnonzero(steps < 0)
+        assert poses[restart + 1]["sequence"] < 20
+        assert poses[restart + 1]["time_us"] < 200_000 < poses[restart]["time_us"]
+        assert 1.1 < np.mean(np.delete(steps, restart)) < 1.45
+        packets = datagrams(ports.devices["lidar"]["msop_port"], 2000)
+        numbers = [int.from_bytes(packet[4:6], "big") for packet in packets]
+        lost = sum((after - before - 1) % 630 for before, after in pairwise(numbers))
+        assert 5 <= lost <= 45
+    finally:
+        ports.close()
 
 
 @pytest.mark.parametrize(

@@ -134,3 +134,23 @@ def test_each_output_comes_at_its_rate_and_the_counter_counts_messages():
 
 def test_nothing_is_measured_in_config_mode():
     assert configuring().message(0, STILL) == b""
+
+
+def test_a_fast_model_has_a_thousand_samples_a_second():
+    device = XbusDevice(1, 1000)
+    device.receive(TO_CONFIG)
+    (answer,) = device.receive(xbus_message(0xC0, struct.pack(">HHHH", 0x4020, 1000, 0x8020, 400)))
+    assert list(struct.iter_unpack(">HH", answer[4:-1])) == [(0x4020, 1000), (0x8020, 250)]
+    device.receive(TO_MEASUREMENT)
+    assert all(device.message(number, STILL) for number in range(1000))
+
+
+def test_it_wakes_up_with_a_message():
+    assert XbusDevice(1, 400).greeting() == bytes.fromhex("FA FF 3E 00 C3")
+
+
+def test_messages_that_were_not_sent_do_not_count():
+    device = XbusDevice(1, 400)
+    messages = [device.message(number, STILL) for number in range(5)]
+    device.withdraw([*messages[3:], bytes.fromhex("FA FF 31 00 D0")])
+    assert device.packet_counter == 3
