@@ -49,5 +49,11 @@ def bno08x_rvc_simulator(
 ) -> ImuSimulator:
     """A BNO08x of a rig. Raises ValueError with the key path."""
     checked_rate(name, settings.rate_hz, (RATE_HZ,))
-    protocol = ImuProtocol(base_rate_hz=RATE_HZ, make=RvcDevice, shortest_bytes=FRAME_BYTES, wrap_ns=INDEX_WRAP_NS)
+    protocol = ImuProtocol(
+        base_rate_hz=RATE_HZ,
+        make=RvcDevice,
+        shortest_bytes=FRAME_BYTES,
+        wrap_ns=INDEX_WRAP_NS,
+        has_orientation=True,
+    )
     return ImuSimulator(name, protocol, settings.baud, settings.clock, stage, trajectory, faults)

@@ -79,19 +79,22 @@ class ImuProtocol:
 
     base_rate_hz: of the samples that outputs are a fraction of. make: a device as it is at power-up.
     shortest_bytes: the shortest message that carries a sample, for the latency of the line.
-    wrap_ns: when the time counter wraps, None where it does not.
+    wrap_ns: when the time counter wraps, None where it does not. has_orientation: its messages can tell the angles.
     """
 
     base_rate_hz: int
     make: Callable[[], ImuDevice]
     shortest_bytes: int
     wrap_ns: int | None = None
+    has_orientation: bool = False
 
 
 class ImuSensor:
     """Accelerometer, gyroscope, magnetometer and thermometer on the rig."""
 
-    def __init__(self, name: str, stage: Stage, trajectory: Trajectory, base_rate_hz: int) -> None:
+    def __init__(self, name: str, stage: Stage, trajectory: Trajectory, protocol: ImuProtocol) -> None:
+        base_rate_hz = protocol.base_rate_hz
+        self._has_orientation = protocol.has_orientation
         self._stage = stage
         self._trajectory = trajectory
         self._imu = NoisyImu(trajectory, ImuNoise(), base_rate_hz, stage.seed_for("imu", name))
@@ -102,8 +105,9 @@ class ImuSensor:
         world_s = self._stage.world_s(instants.host_ns)
         gyro_rad_s, accel_m_s2 = self._imu.read(world_s)
         mag_ut = self._magnetometer.read(world_s)
-        rotation, _ = self._trajectory.pose(world_s)
-        orientation_rad = yaw_pitch_roll(rotation)
+        orientation_rad = np.zeros_like(mag_ut)
+        if self._has_orientation:
+            orientation_rad = yaw_pitch_roll(self._trajectory.pose(world_s)[0])
         warm_s = (time.monotonic_ns() - self._stage.epoch_ns) * 1e-9
         celsius = 36.0 - 6.0 * math.exp(-warm_s / 300.0)
         columns = (accel_m_s2, gyro_rad_s, mag_ut, orientation_rad)
@@ -180,7 +184,7 @@ class ImuSimulator:
             self._line.schedule.power_cut,
         )
         self._delay = stage.delay(name, DELAY)
-        self._sensor = ImuSensor(name, stage, trajectory, protocol.base_rate_hz)
+        self._sensor = ImuSensor(name, stage, trajectory, protocol)
         self._device = protocol.make()
         self._power_ups = 0
         self._measuring_since_ns = 0
@@ -209,7 +213,7 @@ class ImuSimulator:
 
     def _sample_ahead(self) -> None:
         """Queue the messages of the next samples when fewer than the lookahead are left."""
-        if self._grid.next_host_ns() > time.monotonic_ns() + _LOOKAHEAD_NS:
+        if self._grid.next_host_ns > time.monotonic_ns() + _LOOKAHEAD_NS:
             return
         instants = self._grid.take(_BATCH)
         release_ns = self._delay.release_ns(instants.host_ns).tolist()

@@ -144,7 +144,7 @@ class NmeaSimulator:
         """Send fixes for ever."""
         self._grid.start(time.monotonic_ns(), ahead=1)
         while True:
-            while time.monotonic_ns() < self._grid.next_host_ns() - _LOOKAHEAD_NS:
+            while time.monotonic_ns() < self._grid.next_host_ns - _LOOKAHEAD_NS:
                 self._line.exchange()  # commands are read and not followed
                 if not self.opened and self._line.is_open():
                     self.opened.set()

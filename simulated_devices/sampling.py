@@ -28,26 +28,27 @@ class Instants:
 class SampleGrid:
     """Every period of a device's clock; after a power cut the clock starts anew from zero, and so do the numbers.
 
-    power_ups: how often that has happened. keeps_time: the clock survives (as UTC does, from the satellites).
+    next_host_ns: when the next sample is due. power_ups: how often power came back.
     """
 
     def __init__(
         self, clock: DeviceClock, period_ns: float, power_cut: PowerCut = steady_power, *, keeps_time: bool = False
     ) -> None:
+        """keeps_time: the clock survives a power cut (as UTC does, which comes from the satellites)."""
         self.clock = clock
         self.power_ups = 0
         self._period_ns = period_ns
         self._power_cut = power_cut
         self._keeps_time = keeps_time
-        self._next = 0
+        self._begin_at(0)
 
     def start(self, host_ns: int, ahead: int = 2) -> None:
         """Begin so many samples after a host time."""
-        self._next = int(self.clock.device_ns(host_ns) // self._period_ns) + ahead
+        self._begin_at(int(self.clock.device_ns(host_ns) // self._period_ns) + ahead)
 
-    def next_host_ns(self) -> int:
-        """When the next sample is due."""
-        return int(self._at(np.array([self._next])).host_ns[0])
+    def _begin_at(self, number: int) -> None:
+        self._next = number
+        self.next_host_ns = int(self._at(np.array([number])).host_ns[0])
 
     def take(self, count: int) -> Instants:
         """The next samples: `count` of them, fewer up to a power cut, but at least one."""
@@ -62,7 +63,7 @@ class SampleGrid:
         if cut is not None:
             powered = instants.host_ns < cut[0]
             instants = Instants(instants.numbers[powered], instants.device_ns[powered], instants.host_ns[powered])
-        self._next += len(instants.numbers)
+        self._begin_at(self._next + len(instants.numbers))
         return instants
 
     def _at(self, numbers: Int64Array) -> Instants:

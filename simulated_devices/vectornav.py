@@ -388,5 +388,6 @@ def vectornav_simulator(
         base_rate_hz=IMU_RATE_HZ,
         make=lambda: VnDevice(serial_number, settings.baud, ascii_rate_hz),
         shortest_bytes=BinaryOutput(1, 1, ((COMMON_GROUP, 0x0121),)).size_bytes,
+        has_orientation=True,
     )
     return ImuSimulator(name, protocol, settings.baud, settings.clock, stage, trajectory, faults)

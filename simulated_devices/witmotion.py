@@ -144,5 +144,6 @@ def witmotion_simulator(
         base_rate_hz=BASE_RATE_HZ,
         make=lambda: WitDevice(settings.baud, rate_hz, settings.mag_ut_per_lsb),
         shortest_bytes=11,
+        has_orientation=True,
     )
     return ImuSimulator(name, protocol, settings.baud, settings.clock, stage, trajectory, faults)

@@ -33,7 +33,7 @@ def test_the_grid_does_not_depend_on_how_it_is_taken(counts):
     for column in ("numbers", "device_ns", "host_ns"):
         np.testing.assert_array_equal(joined(pieces, column), getattr(one, column))
     assert set(np.diff(one.device_ns)) <= {PERIOD_NS}
-    assert samples.next_host_ns() > one.host_ns[-1]
+    assert samples.next_host_ns > one.host_ns[-1]
 
 
 def test_a_rate_that_divides_nothing_keeps_its_mean():
