@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 
 import msgspec
 
@@ -37,6 +38,10 @@ ACCELERATION = 0x4020
 RATE_OF_TURN = 0x8020
 MAGNETIC_FIELD = 0xC020
 STATUS_WORD = 0xE020
+GNSS_PVT = 0x7010
+GNSS_PVT_BYTES = 94
+GNSS_RATE_HZ = 4
+GNSS_AGE_TICKS = 417  # a fix carries the time of its measurement, as real devices do
 QUANTITY_MASK = 0xF8F0
 WITH_EVERY_MESSAGE = 0xFFFF
 
@@ -157,22 +162,37 @@ class XbusDevice(ImuDevice):
     def message(self, sample_number: int, reading: Reading) -> bytes:
         """See `ImuDevice`: MTData2."""
         due = [item for item, rate in self.outputs if self._is_due(rate, sample_number)]
-        timed = [item for item, rate in self.outputs if rate != WITH_EVERY_MESSAGE]
-        if not self.measuring or (timed and not set(due) & set(timed)):
+        timed = {item for item, rate in self.outputs if rate != WITH_EVERY_MESSAGE}
+        if not self.measuring or (timed and not set(due) & timed):
             return b""
-        data = b"".join(self._item(item, reading) for item in due)
+        fix = [item for item in due if item & QUANTITY_MASK == GNSS_PVT]
+        measured = [item for item in due if item not in fix]
+        older = replace(reading, time_ns=reading.time_ns - GNSS_AGE_TICKS * TICK_NS)
+        data = self._data_message(measured, reading) if not timed or set(measured) & timed else b""
+        # A fix comes in a message of its own, with the outputs that every message has.
+        with_fix = [item for item in measured if item not in timed]
+        return data + (self._data_message([*with_fix, *fix], older) if fix else b"")
+
+    def _data_message(self, items: list[int], reading: Reading) -> bytes:
+        data = b"".join(self._item(item, reading) for item in items)
         self.packet_counter = (self.packet_counter + 1) & 0xFFFF
         return xbus_message(MT_DATA2, data)
 
     def withdraw(self, messages: list[bytes]) -> None:
         """See `ImuDevice`: the counter goes on with the next message that is sent."""
-        unsent = sum(message[2] == MT_DATA2 for message in messages)
+        unsent = 0
+        for message in messages:
+            while message:
+                unsent += message[2] == MT_DATA2
+                message = message[_message_bytes(message) :]
         self.packet_counter = (self.packet_counter - unsent) & 0xFFFF
 
     def _allowed_rate(self, item: int, rate_hz: int) -> int:
         """The nearest rate the device has that is not above the one asked for; 0 turns the output off."""
         if item & QUANTITY_MASK in _TIME_AND_STATUS:
             return WITH_EVERY_MESSAGE if rate_hz else 0
+        if item & QUANTITY_MASK == GNSS_PVT:
+            return min(rate_hz, GNSS_RATE_HZ) and GNSS_RATE_HZ
         return max((rate for rate in RATES_HZ if rate <= rate_hz and self._base_rate_hz % rate == 0), default=0)
 
     def _is_due(self, rate_hz: int, sample_number: int) -> bool:
@@ -188,13 +208,20 @@ class XbusDevice(ImuDevice):
             payload = struct.pack(">I", reading.time_ns // TICK_NS & 0xFFFFFFFF)
         elif quantity == STATUS_WORD:
             payload = struct.pack(">I", STATUS_OK)
+        elif quantity == GNSS_PVT:
+            payload = bytes(GNSS_PVT_BYTES)  # no fix: it stands in a room
         else:
             payload = encode_values(_values(quantity, reading), item & 0x3)
         return struct.pack(">HB", item, len(payload)) + payload
 
 
 _TIME_AND_STATUS = {PACKET_COUNTER, SAMPLE_TIME_FINE, STATUS_WORD}
-_ITEMS = {*_TIME_AND_STATUS, TEMPERATURE, ACCELERATION, RATE_OF_TURN, MAGNETIC_FIELD}
+_ITEMS = {*_TIME_AND_STATUS, TEMPERATURE, ACCELERATION, RATE_OF_TURN, MAGNETIC_FIELD, GNSS_PVT}
+
+
+def _message_bytes(data: bytes) -> int:
+    """The size of the message that `data` begins with."""
+    return 5 + data[3] if data[3] != EXTENDED_LENGTH else 7 + int.from_bytes(data[4:6], "big")
 
 
 def base_rate_of(rate_hz: int) -> int:

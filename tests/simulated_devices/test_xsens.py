@@ -154,3 +154,21 @@ def test_messages_that_were_not_sent_do_not_count():
     messages = [device.message(number, STILL) for number in range(5)]
     device.withdraw([*messages[3:], bytes.fromhex("FA FF 31 00 D0")])
     assert device.packet_counter == 3
+
+
+def test_fixes_come_in_messages_of_their_own_with_an_older_time():
+    device = configured((0x1020, 0xFFFF), (0x1060, 0xFFFF), (0x4020, 100), (0x7010, 10))
+    reading = Reading(571_985_400_000, (0, 0, 9.8), (0, 0, 0))
+    messages = [message for number in range(400) if (message := device.message(number, reading))]
+    assert len(messages) == 100
+    both = [message for message in messages if len(message) > 100]
+    assert len(both) == 4
+    first, second = both[0][:32], both[0][32:]
+    assert first[:4] == bytes.fromhex("FA FF 36 1B")
+    assert second[:4] == bytes.fromhex("FA FF 36 6D")
+    assert (first[9:16], second[9:16]) == (bytes.fromhex("10 60 04 00 57 47 2E"), bytes.fromhex("10 60 04 00 57 45 8D"))
+    assert second[16:19] == bytes.fromhex("70 10 5E")
+    assert [sum(message[1:]) % 256 for message in (first, second)] == [0, 0]
+    assert device.packet_counter == 104
+    device.withdraw([both[0], messages[1]])
+    assert device.packet_counter == 101
