@@ -196,6 +196,7 @@ def cameras(system: Path = SYSTEM) -> list[Camera]:
 def oak_devices(problems: list[str], *, network: bool = False) -> list[OakDevice]:
     """OAK devices, where depthai is installed."""
     os.environ.setdefault("DEPTHAI_LEVEL", "off")  # it would print into the yaml
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # it would take signals that Python ignores
     if not network:
         os.environ.setdefault("DEPTHAI_PROTOCOL", "usb")
     try:

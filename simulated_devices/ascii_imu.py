@@ -31,18 +31,19 @@ COLUMNS = ("time", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "temper
 class AsciiImuSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Keys of the device that the simulation honours.
 
-    columns: which number comes where; "-" is a column that means nothing. time_bits: width of the time counter.
+    columns: which number comes where; "-" is a column that means nothing. separator: a comma where none is given.
+    time_wrap_bits: width of the time counter.
     """
 
     clock: str = ""
     baud: int = 115200
     rate_hz: int = 100
     columns: tuple[str, ...] = COLUMNS
-    separator: str = ","
+    separator: str = ""
     prefix: str = ""
     checksum: bool = False
     time_unit: str = "us"
-    time_bits: int = 32
+    time_wrap_bits: int = 32
     accel_unit: str = "m/s2"
     gyro_unit: str = "rad/s"
     mag_unit: str = "uT"
@@ -68,7 +69,9 @@ class AsciiLine:
 
     def line(self, reading: Reading) -> bytes:
         """One line with its end."""
-        text = self._settings.prefix + self._settings.separator.join(printer(reading) for printer in self._printers)
+        text = self._settings.prefix + (self._settings.separator or ",").join(
+            printer(reading) for printer in self._printers
+        )
         if self._settings.checksum:
             total = 0
             for byte in text.lstrip("$").encode():
@@ -79,9 +82,10 @@ class AsciiLine:
     @property
     def wrap_ns(self) -> int | None:
         """When the time column wraps."""
-        if "time" not in self._settings.columns or self._settings.time_bits == 0:
+        settings = self._settings
+        if "time" not in settings.columns or settings.time_wrap_bits == 0 or settings.time_unit == "s":
             return None
-        return TIME_UNITS_NS[self._settings.time_unit] << self._settings.time_bits
+        return TIME_UNITS_NS[self._settings.time_unit] << self._settings.time_wrap_bits
 
     def _printer(self, column: str) -> Printer:
         if column == "-":
@@ -102,10 +106,9 @@ class AsciiLine:
         return lambda reading: _number(reading.mag_ut[axis], *MAG_UNITS[self._settings.mag_unit])
 
     def _time(self, reading: Reading) -> str:
-        unit_ns, bits = TIME_UNITS_NS[self._settings.time_unit], self._settings.time_bits
-        if self._settings.time_unit == "s":  # a real number: what wraps is its whole part
-            time_ns = reading.time_ns % (SECOND_NS << bits) if bits else reading.time_ns
-            return f"{time_ns / SECOND_NS:.6f}"
+        unit_ns, bits = TIME_UNITS_NS[self._settings.time_unit], self._settings.time_wrap_bits
+        if self._settings.time_unit == "s":  # a real number does not wrap
+            return f"{reading.time_ns / SECOND_NS:.6f}"
         ticks = reading.time_ns // unit_ns
         return str(ticks & ((1 << bits) - 1) if bits else ticks)
 

@@ -52,7 +52,7 @@ class VectornavSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     clock: str = ""
     baud: int = 115200
-    rate_hz: int = 200
+    rate_hz: int = 100
 
 
 def xor_checksum(body: bytes) -> int:

