@@ -212,11 +212,11 @@ class RobosenseSimulator:
                 self._send(sender, self._ready.get())
 
     def _build(self) -> None:
-        self._grid.start(time.monotonic_ns())
-        for frame in self._frames():
+        for frame in self._frames(self._grid.clock.device_ns(time.monotonic_ns()) // FRAME_NS + 2):
             self._ready.put(frame)
 
-    def _frames(self) -> Iterator[_Frame]:
+    def _frames(self, index: int) -> Iterator[_Frame]:
+        self._grid.begin_at(index)
         while True:
             instants = self._grid.take(1)
             packet_ns = instants.device_ns + self._offset_ns

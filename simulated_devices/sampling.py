@@ -40,13 +40,14 @@ class SampleGrid:
         self._period_ns = period_ns
         self._power_cut = power_cut
         self._keeps_time = keeps_time
-        self._begin_at(0)
+        self.begin_at(0)
 
     def start(self, host_ns: int, ahead: int = 2) -> None:
         """Begin so many samples after a host time."""
-        self._begin_at(int(self.clock.device_ns(host_ns) // self._period_ns) + ahead)
+        self.begin_at(int(self.clock.device_ns(host_ns) // self._period_ns) + ahead)
 
-    def _begin_at(self, number: int) -> None:
+    def begin_at(self, number: int) -> None:
+        """Begin with the sample of that number."""
         self._next = number
         self.next_host_ns = int(self._at(np.array([number])).host_ns[0])
 
@@ -63,7 +64,7 @@ class SampleGrid:
         if cut is not None:
             powered = instants.host_ns < cut[0]
             instants = Instants(instants.numbers[powered], instants.device_ns[powered], instants.host_ns[powered])
-        self._begin_at(self._next + len(instants.numbers))
+        self.begin_at(self._next + len(instants.numbers))
         return instants
 
     def _at(self, numbers: Int64Array) -> Instants:

@@ -67,7 +67,7 @@ def test_a_packet_about_the_device():
 
 def test_frames_follow_each_other_on_the_grid_of_the_clock(simulator):
     frames = simulator._frames(1_000)
-    clock = simulator._clock
+    clock = simulator._grid.clock
     for index in (1_000, 1_001):
         frame = next(frames)
         packets = np.frombuffer(frame.data, dtype=np.uint8).reshape(630, 1210).astype(np.int64)
