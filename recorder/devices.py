@@ -258,7 +258,10 @@ def _probing() -> Callable[[SerialPort], SerialPort]:
 
 
 def probe_port(port: SerialPort, recognise: Recognise, *, listen_s: float = PROBE_S) -> SerialPort:
-    """Listen on a port at likely speeds until what speaks on it is recognised; nothing is sent."""
+    """Listen on a port at likely speeds until what speaks on it is recognised.
+
+    Nothing is sent, but opening a port moves its line DTR, which resets some boards.
+    """
     try:
         with serial.Serial(port.path, PROBE_BAUDS[0], timeout=0, exclusive=True) as line:
             return _listen(port, line, recognise, listen_s)
@@ -313,7 +316,7 @@ def rig_yaml(found: Found) -> str:
         name = kind if counts[kind] == 1 else f"{kind}{counts[kind]}"
         text = f"{name}: {yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, width=1000).strip()}"
         problem = _refusal(name, entry)
-        accepted.append(f"  # {comment}" if problem is None else f"  # {comment}; {problem}")
+        accepted.append("  # " + " ".join((comment if problem is None else f"{comment}; {problem}").split()))
         accepted.append(f"  {text}" if problem is None else f"  # {text}")
     has_devices = any(not line.lstrip().startswith("#") for line in accepted)
     if not accepted:

@@ -13,12 +13,14 @@ from heapq import merge
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from drivers.samples import POINT_DTYPE, FixSample, FrameSample, ImuSample, PoseSample, ScanSample, VideoFormat
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.recording.manifest import DeviceSummary, StreamSummary
 from recorder.recording.writer import RecordingWriter, new_manifest
+from simulated_devices.bno08x_rvc import Bno08xRvcSettings
 from simulated_devices.camera import ClientStream, PictureEncoder
 from simulated_devices.nmea import ORIGIN, SIGMA_M
 from simulated_devices.pose import quaternion
@@ -77,10 +79,11 @@ class Twin:
         return float(self.entries[name].get(key, default))
 
     def _imu(self, order: int, name: str) -> Iterator[Item]:
-        rate_hz = self._rate_hz(name, "rate_hz", 400)
+        settings, _ = IMUS[self.entries[name]["driver"]]
+        has_gyro_and_mag = settings is not Bno08xRvcSettings
+        rate_hz = imu_rate_hz(self.entries[name])
         stage, trajectory = self._cast.stage, self._cast.trajectory
         imu = NoisyImu(trajectory, ImuNoise(), rate_hz, stage.seed_for("imu", name))
-        magnetometer = NoisyMagnetometer(trajectory, stage.seed_for("magnetometer", name))
         magnetometer = NoisyMagnetometer(trajectory, stage.seed_for("magnetometer", name))
         for times_ns in self._times(rate_hz, 0):
             world_s = _world_s(times_ns)
@@ -88,7 +91,10 @@ class Twin:
             field_ut = magnetometer.read(world_s)
             for index, time_ns in enumerate(times_ns.tolist()):
                 accel_m_s2, gyro_rad_s, mag_ut = (tuple(values[index].tolist()) for values in (accel, gyro, field_ut))
-                yield time_ns, order, name, ImuSample(None, time_ns, accel_m_s2, gyro_rad_s, mag_ut)
+                if has_gyro_and_mag:
+                    yield time_ns, order, name, ImuSample(None, time_ns, accel_m_s2, gyro_rad_s, mag_ut)
+                else:
+                    yield time_ns, order, name, ImuSample(None, time_ns, accel_m_s2, None)
 
     def _pose(self, order: int, name: str) -> Iterator[Item]:
         for times_ns in self._times(self._rate_hz(name, "rate_hz", 100), 0):
@@ -161,6 +167,12 @@ def _points(
     return returned
 
 
+def imu_rate_hz(entry: dict[str, Any]) -> float:
+    """The rate of an IMU's entry, or the one it has by itself."""
+    settings, _ = IMUS[entry["driver"]]
+    return float(entry.get("rate_hz", msgspec.structs.asdict(settings())["rate_hz"]))
+
+
 def write_ideal(source: dict[str, Any], folder: Path, duration_s: float) -> None:
     """Write the twin of a rig into a folder that is empty or not there yet. Raises RecorderError."""
     if folder.exists() and any(folder.iterdir()):
@@ -168,12 +180,14 @@ def write_ideal(source: dict[str, Any], folder: Path, duration_s: float) -> None
     twin = Twin(source, duration_s)
     folder.mkdir(parents=True, exist_ok=True)
     errors: list[str] = []
-    kinds = {"xsens": "imu", "nmea": "gnss", "robosense": "lidar", "stream": "frames", "pose": "pose"}
-    rates = {"imu": ("rate_hz", 400), "gnss": ("rate_hz", 10), "frames": ("fps", 20), "pose": ("rate_hz", 100)}
+    kinds = {**dict.fromkeys(IMUS, "imu"), "nmea": "gnss", "robosense": "lidar", "stream": "frames", "pose": "pose"}
+    rates = {"gnss": ("rate_hz", 10), "frames": ("fps", 20), "pose": ("rate_hz", 100)}
     devices = {}
     for name, entry in twin.entries.items():
         kind = kinds[entry["driver"]]
         rate_hz = float(entry.get(*rates[kind])) if kind in rates else 10.0
+        if kind == "imu":
+            rate_hz = imu_rate_hz(entry)
         devices[name] = DeviceSummary(entry["driver"], "true time", 0.0, {}, StreamSummary(kind, rate_hz))
     manifest = new_manifest(
         folder.name, start_monotonic_ns=0, utc_ns=TWIN_UTC_NS, utc_source="simulated", cameras=twin.cameras,

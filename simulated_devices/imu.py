@@ -220,6 +220,7 @@ class ImuSimulator:
         if self._grid.power_ups != self._power_ups:
             self._power_ups = self._grid.power_ups
             self._device = self._protocol.make()
+            self._line.power_up()
             if greeting := self._device.greeting():
                 self._line.push(release_ns[0], greeting)
         readings = self._sensor.read(instants)

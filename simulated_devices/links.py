@@ -27,7 +27,8 @@ class SerialLine:
         self.schedule = Schedule(faults, lambda: stage.start_ns)
         self._name = name
         self._is_perfect = faults == NO_FAULTS
-        self._uart = UartTransmitter(faults.wrong_baud or baud)
+        self._power_up_baud = faults.wrong_baud or baud
+        self._uart = UartTransmitter(self._power_up_baud)
         self._is_strict = faults.wrong_baud is not None
         self._message_faults = MessageFaults(faults, stage.seed, name)
         self._noise = Noise(faults, stage.seed, name)
@@ -68,6 +69,10 @@ class SerialLine:
     def change_baud(self, baud: int, last_ns: int) -> None:
         """Go on at another speed once what was pushed for `last_ns` is through."""
         self._baud_change = (last_ns + _BAUD_CHANGE_NS, baud)
+
+    def power_up(self) -> None:
+        """Go back to the speed of the beginning."""
+        self._uart.baud, self._baud_change = self._power_up_baud, None
 
     def exchange(self) -> bytes:
         """Wait until something is due or comes in, 10 ms at most; send what is due; give what the other side sent."""

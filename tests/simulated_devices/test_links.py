@@ -160,6 +160,8 @@ def test_a_device_answers_before_it_changes_its_speed(tmp_path, line_of):
     while line.transmission_ns(1) == 1_041_667:
         line.exchange()
     assert line.transmission_ns(1) == 520_833
+    line.power_up()
+    assert line.transmission_ns(1) == 1_041_667
     os.close(host)
 
 
