@@ -12,11 +12,12 @@ from collections.abc import Callable
 import msgspec
 
 from simulated_devices.faults import NO_FAULTS, FaultSettings
-from simulated_devices.imu import ImuDevice, ImuProtocol, ImuSimulator, Reading, checked_rate, fraction_of
+from simulated_devices.imu import STILL, ImuDevice, ImuProtocol, ImuSimulator, Reading, checked_rate, fraction_of
 from simulated_devices.timing import SECOND_NS, Stage
 from simulated_devices.world import Trajectory
 
 SYNC = b"\x75\x65"
+MAX_PAYLOAD_BYTES = 255
 BASE_RATE_HZ = 1000
 RATES_HZ = tuple(rate for rate in range(1, BASE_RATE_HZ + 1) if BASE_RATE_HZ % rate == 0)
 BAUDS = (9600, 19200, 115200, 230400, 460800, 921600)
@@ -200,6 +201,8 @@ class MipDevice(ImuDevice):
                 return INVALID_PARAMETER, []
             asked = list(struct.iter_unpack(">BH", data[2:]))
             if any(descriptor not in _FIELDS or decimation == 0 for descriptor, decimation in asked):
+                return INVALID_PARAMETER, []
+            if sum(2 + len(_FIELDS[descriptor](STILL)) for descriptor, _ in asked) > MAX_PAYLOAD_BYTES:
                 return INVALID_PARAMETER, []
             self._format = [(descriptor, decimation) for descriptor, decimation in asked]
         elif function == READ:
