@@ -151,6 +151,8 @@ class ClockStream:
 
     def _observe_unsure(self, ticks: int, arrival_ns: int) -> int:
         """The first sample of a stream or epoch, duplicates, disorder, stalls, restarts, garbage."""
+        if self._modulus:
+            ticks %= self._modulus  # a counter shows no more; higher bits are garbage
         estimator = self._estimator
         if not estimator.started and abs(self._ns(ticks)) < FAR:
             estimator.start(self._ns(ticks), arrival_ns)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from recorder.clock import ClockMap, refine, stored_sigma_ppm
@@ -346,6 +346,8 @@ def test_nothing_raises_and_no_stamp_is_late(pairs: list[tuple[int, int]], wrap_
     data=st.lists(st.tuples(st.integers(-(1 << 63), (1 << 63) - 1), STEPS), min_size=1, max_size=60),
     wrap_bits=st.sampled_from([0, 8, 32]),
 )
+@example(data=[(1_000_000, 0), (9_223_372_036_852_775_807, 0), (-1_000_000, 0), (0, 0)], wrap_bits=32)
+@example(data=[(1_000_000, 0), (18_014_398_507_481_984, 0), (-1_000_000, 0), (0, 0)], wrap_bits=32)
 def test_batches_and_refine_never_raise(data: list[tuple[int, int]], wrap_bits: int) -> None:
     ticks = np.array([a for a, _ in data], dtype=np.int64)
     arrival_ns = BOOT_NS + np.cumsum([b for _, b in data])
