@@ -12,8 +12,10 @@ import select
 import socket
 import struct
 import termios
+import threading
 import time
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import serial
@@ -24,6 +26,7 @@ from drivers.samples import Chunk, DeviceEvent
 READ_BYTES = 65536
 DATAGRAM_BYTES = 65535
 DATAGRAMS_PER_READ = 512
+GIVEN_DATAGRAMS = 20_000
 RECEIVE_BUFFER_BYTES = 32 << 20
 SILENCE_S = 3.0
 WRITE_TIMEOUT_S = 2.0
@@ -108,28 +111,68 @@ class UdpLink:
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
-    def __init__(self, address: str, ports: tuple[int, ...]) -> None:
-        """Bind the ports. Raises DeviceError when one is taken or the address is not an IPv4 address."""
+    def __init__(
+        self,
+        address: str,
+        ports: tuple[int, ...],
+        *,
+        source_port: int = 0,
+        multicast_group: str = "",
+        interface: str = "",
+        shared: bool = False,
+    ) -> None:
+        """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address.
+
+        source_port: the device's own port, 0: any. multicast_group: joined on the interface with this host's address
+        `interface` (empty: as the system chooses). shared: other links of this process may use the same ports, each
+        for its own device (or for its own part of what that device sends there).
+        """
         self.address = address
+        self.source_port = source_port
         self.foreign = 0
+        self._given: deque[Chunk] = deque(maxlen=GIVEN_DATAGRAMS)
+        self._shared: dict[int, _SharedPort] = {}
         self.kernel_drops = 0
         self._drops_by_socket: dict[int, int] = {}
         self._sockets: dict[int, socket.socket] = {}
         self._readable = select.poll()
         self._realtime_minus_monotonic_ns = _realtime_minus_monotonic_ns()
-        try:
-            packed = socket.inet_pton(socket.AF_INET, address)
-        except OSError as error:
-            raise DeviceError(f"address {address!r}: not an IPv4 address") from error
-        bind_address = "127.0.0.1" if packed[0] == 127 else "0.0.0.0"
+        bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not multicast_group else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
-            udp = self._bind(bind_address, port)
+            udp = self._share(bind_address, port) if shared else self._bind(bind_address, port)
             self._sockets[udp.fileno()] = udp
             self._readable.register(udp, select.POLLIN)
+            if multicast_group:
+                self._join(udp, multicast_group, interface)
         self.receive_buffer_bytes = min(
             bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for bound in self._sockets.values()
         )
+
+    def _share(self, bind_address: str, port: int) -> socket.socket:
+        """The socket that all links of this process with this port use."""
+        with _shared_ports_lock:
+            entry = _shared_ports.get((bind_address, port))
+            if entry is None:
+                udp = self._bind(bind_address, port)
+                entry = _shared_ports[bind_address, port] = _SharedPort(udp, (bind_address, port))
+            entry.links.append(self)
+            self._shared[entry.udp.fileno()] = entry
+        return entry.udp
+
+    def _join(self, udp: socket.socket, group: str, interface: str) -> None:
+        member = _packed_ipv4(group) + (_packed_ipv4(interface) if interface else bytes(4))
+        try:
+            udp.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:  # another link of this port has joined already
+                self.close()
+                where = f" on {interface}" if interface else ""
+                raise DeviceError(f"multicast group {group}{where}: cannot join: {_reason(error)}") from error
+
+    def accepts(self, source: tuple[str, int]) -> bool:
+        """Whether a datagram from there is of this link's device."""
+        return source[0] == self.address and self.source_port in (0, source[1])
 
     def _bind(self, bind_address: str, port: int) -> socket.socket:
         udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -150,8 +193,8 @@ class UdpLink:
 
     def read(self, timeout_s: float) -> list[Chunk]:
         """What has come on all ports, in order of arrival; empty after `timeout_s`."""
-        events = self._readable.poll(_milliseconds(timeout_s))
-        if not events:
+        events = self._readable.poll(0 if self._given else _milliseconds(timeout_s))
+        if not events and not self._given:
             return []
         offset_ns = _realtime_minus_monotonic_ns()
         wall_clock_was_set = abs(offset_ns - self._realtime_minus_monotonic_ns) > WALL_CLOCK_STEP_NS
@@ -159,8 +202,12 @@ class UdpLink:
         chunks: list[Chunk] = []
         for descriptor, _ in events:
             # What waits may have been stamped before the wall clock was set: then the time of reading is the truth.
-            self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns, chunks)
-        if len(events) > 1:
+            with self._shared[descriptor].lock if descriptor in self._shared else contextlib.nullcontext():
+                self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns, chunks)
+        given = bool(self._given)
+        while self._given:
+            chunks.append(self._given.popleft())
+        if len(events) > 1 or given:
             chunks.sort(key=lambda chunk: chunk.arrival_ns)
         return chunks
 
@@ -185,21 +232,73 @@ class UdpLink:
                         arrival_ns = stamp_ns
                 elif kind == SO_RXQ_OVFL:
                     self._count_kernel_drops(udp.fileno(), _UINT32.unpack_from(payload)[0])
-            if source[0] != self.address:
+            if self._shared:
+                self._deal_out(udp, Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination), chunks)
+            elif self.accepts(source):
+                chunks.append(Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination))
+            else:
                 self.foreign += 1
-                continue
-            chunks.append(Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination))
+
+    def _deal_out(self, udp: socket.socket, chunk: Chunk, chunks: list[Chunk]) -> None:
+        """Give a datagram to all links that accept it; one that nobody accepts is foreign to the one that read it."""
+        assert chunk.source is not None
+        links = self._shared[udp.fileno()].links
+        takers = [link for link in links if link.accepts(chunk.source)] if len(links) > 1 else [self]
+        self.foreign += not takers or (len(links) == 1 and not self.accepts(chunk.source))
+        for link in takers:
+            if link is not self:
+                link._given.append(chunk)  # noqa: SLF001
+            elif self.accepts(chunk.source):
+                chunks.append(chunk)
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
-        self.kernel_drops += (total - self._drops_by_socket.get(descriptor, 0)) & 0xFFFFFFFF
-        self._drops_by_socket[descriptor] = total
+        seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket
+        self.kernel_drops += (total - seen.get(descriptor, 0)) & 0xFFFFFFFF
+        seen[descriptor] = total
 
     def close(self) -> None:
-        """Close all sockets."""
+        """Close all sockets that no other link uses."""
         for descriptor, udp in self._sockets.items():
             self._readable.unregister(descriptor)
-            udp.close()
+            if descriptor in self._shared:
+                self._shared[descriptor].leave(self)
+            else:
+                udp.close()
         self._sockets.clear()
+        self._shared.clear()
+
+
+@dataclass(slots=True, eq=False)
+class _SharedPort:
+    """One socket for all links of this process that share its port. The one who reads deals out to the others.
+
+    drops_seen: what the kernel has told of drops; they count for the link that happened to read it.
+    """
+
+    udp: socket.socket
+    key: tuple[str, int]
+    links: list["UdpLink"] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    drops_seen: dict[int, int] = field(default_factory=dict)
+
+    def leave(self, link: "UdpLink") -> None:
+        """The last one closes the socket."""
+        with _shared_ports_lock:
+            self.links.remove(link)
+            if not self.links:
+                del _shared_ports[self.key]
+                self.udp.close()
+
+
+_shared_ports: dict[tuple[str, int], _SharedPort] = {}
+_shared_ports_lock = threading.Lock()
+
+
+def _packed_ipv4(address: str) -> bytes:
+    try:
+        return socket.inet_pton(socket.AF_INET, address)
+    except OSError as error:
+        raise DeviceError(f"address {address!r}: not an IPv4 address") from error
 
 
 class CountsBadInput(Protocol):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -21,8 +22,10 @@ from hypothesis import strategies as st
 from drivers import links
 from drivers.device import DeviceError
 from drivers.lidar import robosense
+from drivers.lidar.models import M1, recognise
+from drivers.lidar.points import PointDecoder
 from drivers.lidar.robosense import DRIVER, RobosenseConfig, RobosenseDriver
-from drivers.lidar.robosense_decoder import M1Decoder, PointDecoder, is_measurement
+from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
 from drivers.links import UdpLink
 from drivers.samples import POINT_DTYPE, ClockPairs, DeviceEvent, Received, ScanSample
 
@@ -73,7 +76,11 @@ def difop() -> bytes:
     return bytes(body)
 
 
-def feed_all(decoder: M1Decoder, packets: list[bytes], finish: bool = True) -> list[ScanSample]:
+def m1_decoder(**options: Any) -> RobosenseDecoder:
+    return RobosenseDecoder(M1, PointOptions(**options))
+
+
+def feed_all(decoder: RobosenseDecoder, packets: list[bytes], finish: bool = True) -> list[ScanSample]:
     scans = [scan for one in packets for scan in decoder.feed(one)]
     return scans + decoder.finish() if finish else scans
 
@@ -81,11 +88,10 @@ def feed_all(decoder: M1Decoder, packets: list[bytes], finish: bool = True) -> l
 @pytest.mark.parametrize(("name", "variant"), [(name, variant) for name in EXPECTED for variant in EXPECTED[name]])
 def test_points_are_those_of_the_vendors_driver(name: str, variant: str) -> None:
     limits = (1.0, 50.0) if variant == "dense_1_50" else (None, None)
-    packets = [one for one in datagrams(name) if is_measurement(one)]
+    packets = [one for one in datagrams(name) if recognise(one) is M1]
     if name in ("m1_loss", "m1_reorder"):  # the others are empty
         packets = packets[::8]
-    decoder = M1Decoder(*limits)
-    points = decoder.decode_packets(packet_array(packets), keep_invalid=variant == "nan")
+    points = PointDecoder(M1, *limits).decode_packets(packet_array(packets), keep_invalid=variant == "nan")
     assert points.dtype == POINT_DTYPE
     assert len(points) == EXPECTED[name][variant]["points"]
     assert hashlib.sha256(points.tobytes()).hexdigest() == EXPECTED[name][variant]["sha256"]
@@ -95,7 +101,7 @@ def test_worked_example_of_the_manual() -> None:
     example = bytearray(packet(1, START_US + 7))
     example[32:34] = bytes([30, 0])
     example[34:43] = struct.pack(">HHHBBB", 0x0A77, 0x83A2, 0x94DF, 77, 0, 0)
-    point = M1Decoder().decode_packets(packet_array([bytes(example)]))[0]
+    point = PointDecoder(M1).decode_packets(packet_array([bytes(example)]))[0]
     assert [float(point[axis]) for axis in "xyz"] == pytest.approx([7.876, 10.617, 2.165], abs=6e-4)
     assert (point["intensity"], point["ring"]) == (77, 0)
     assert point["timestamp"] == (START_US + 7) * 1e-6 + 30 * 1e-6
@@ -107,7 +113,7 @@ def test_worked_example_of_the_manual() -> None:
 )
 def test_range_limits_hold_both_ends(limits: tuple[float | None, float | None], kept: list[int]) -> None:
     packets = packet_array([packet(1, START_US, radius=radius) for radius in (0, 40, 41, 400, 40000, 40001)])
-    points = M1Decoder(*limits).decode_packets(packets)
+    points = PointDecoder(M1, *limits).decode_packets(packets)
     assert len(points) == 125 * len(kept)
     assert points["x"][::125] == pytest.approx([radius * 0.005 for radius in kept], rel=1e-4)
 
@@ -115,8 +121,8 @@ def test_range_limits_hold_both_ends(limits: tuple[float | None, float | None], 
 @pytest.mark.parametrize("count", [0, 1, 125, 126, 127, 253])
 def test_any_number_of_packets(count: int) -> None:
     packets = frame(0)[:count]
-    points = M1Decoder().decode_packets(packet_array(packets) if packets else np.empty((0, 1210), np.uint8))
-    single = [M1Decoder().decode_packets(packet_array([one])) for one in packets]
+    points = PointDecoder(M1).decode_packets(packet_array(packets) if packets else np.empty((0, 1210), np.uint8))
+    single = [PointDecoder(M1).decode_packets(packet_array([one])) for one in packets]
     assert points.tobytes() == b"".join(one.tobytes() for one in single)
 
 
@@ -133,20 +139,20 @@ FRAMES = {
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_frames_where_the_network_is_not_right(name: str) -> None:
-    decoder = M1Decoder(keep_invalid=True)
+    decoder = m1_decoder(keep_invalid=True)
     packets = datagrams(name)
     scans = feed_all(decoder, packets)
     assert [(s.packets_received, s.packets_expected, s.duplicates, s.is_partial) for s in scans] == FRAMES[name]
     assert decoder.lost_packets == sum(s.packets_expected - s.packets_received for s in scans if not s.is_partial)
     # Each packet's points once, in order of the packets' times.
-    unique = sorted({one for one in packets if is_measurement(one)}, key=lambda one: one[10:20])
+    unique = sorted({one for one in packets if recognise(one) is M1}, key=lambda one: one[10:20])
     points = np.concatenate([scan.points for scan in scans])
-    assert points.tobytes() == PointDecoder(decoder.model).decode_packets(packet_array(unique), True).tobytes()
+    assert points.tobytes() == PointDecoder(M1).decode_packets(packet_array(unique), True).tobytes()
     assert all(first.last_ticks < second.first_ticks for first, second in pairwise(scans))
 
 
 def test_junk_is_counted_and_difop_kept() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     packets = datagrams("m1_midstart_junk")
     feed_all(decoder, packets)
     assert (decoder.bad_frames, decoder.skipped_bytes) == (4, 102 + 1210 + 1210 + 200)
@@ -156,7 +162,7 @@ def test_junk_is_counted_and_difop_kept() -> None:
 
 @pytest.mark.parametrize(("mode", "count"), [(4, 630), (0, 1260)])
 def test_a_whole_frame_is_written_with_its_last_packet(mode: int, count: int) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     first, second = frame(0, count, mode), frame(1, count, mode)
     assert feed_all(decoder, first + second[:19], finish=False) == []
     (scan,) = decoder.feed(second[19])  # the first frame teaches the cadence; the next packets tell that it is over
@@ -169,26 +175,26 @@ def test_a_whole_frame_is_written_with_its_last_packet(mode: int, count: int) ->
 
 
 def test_number_of_packets_is_known_although_each_frame_lost_its_last() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, [one for index in range(4) for one in frame(index)[:-1]])
     assert [scan.packets_expected for scan in scans] == [630] * 4
     assert decoder.lost_packets == 3  # what the last frame lacks at its end may never have been sent
 
 
 def test_another_number_of_packets_is_followed_after_ten_frames() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, [one for index in range(12) for one in frame(index, 600)])
     assert [scan.packets_expected for scan in scans] == [630] * 9 + [600] * 3
 
 
 def test_given_number_of_packets_overrides() -> None:
-    decoder = M1Decoder(packets_per_frame=12)
+    decoder = m1_decoder(packets_per_frame=12)
     scans = feed_all(decoder, frame(0, 12), finish=False)
     assert [scan.packets_expected for scan in scans] == [12]
 
 
 def test_whole_frames_lost_are_counted() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, frame(0) + frame(1) + frame(7)[100:] + frame(8))
     assert [scan.packets_received for scan in scans] == [630, 630, 530, 630]
     assert not any(scan.is_partial for scan in scans)
@@ -197,7 +203,7 @@ def test_whole_frames_lost_are_counted() -> None:
 
 @pytest.mark.parametrize("jump_us", [37_000_000_000, -37_000_000, 130_000, -2_500_000])
 def test_a_jump_of_the_clock_starts_over(jump_us: int) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     moved = frame(2, start_us=START_US + jump_us)
     scans = feed_all(decoder, frame(0) + frame(1)[:300] + moved[300:] + frame(3, start_us=START_US + jump_us))
     assert decoder.restarts == 1
@@ -207,7 +213,7 @@ def test_a_jump_of_the_clock_starts_over(jump_us: int) -> None:
 
 
 def test_one_packet_with_a_wrong_time_is_only_bad() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     packets = [one for index in range(3) for one in frame(index)]
     for place, time_us in ((100, 0), (800, START_US + 10**9), (1300, START_US + 5_000_000), (1500, 8 * 10**15)):
         packets.insert(place, packet(5, time_us))
@@ -218,13 +224,13 @@ def test_one_packet_with_a_wrong_time_is_only_bad() -> None:
 
 @pytest.mark.parametrize("bad", [packet(0, START_US), packet(1261, START_US), packet(1, (1 << 33) * 1_000_000)])
 def test_impossible_number_or_time_is_refused(bad: bytes) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     assert feed_all(decoder, [bad]) == []
     assert (decoder.bad_frames, decoder.skipped_bytes) == (1, 1210)
 
 
 def test_packets_after_their_frame_was_written() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     frames = [frame(index) for index in range(3)]
     missing = frames[1].pop(9)
     feed_all(decoder, frames[0] + frames[1] + frames[2][:100] + [missing, missing, frames[2][5]] + frames[2][100:])
@@ -254,7 +260,7 @@ def disturbed(seed: int, begin: int, loss: float, delay: int) -> list[tuple[int,
 @settings(deadline=None)
 def test_membership_is_exact_whatever_the_network_does(seed: int, begin: int, loss: float, delay: int) -> None:
     arrived = disturbed(seed, begin, loss, delay)
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, [one for _, one in arrived])
     want = Counter(index for index, _ in dict.fromkeys(arrived))
     got = {(scan.first_ticks - START_US) // 100_000: scan for scan in scans}
@@ -271,7 +277,7 @@ def test_membership_is_exact_whatever_the_network_does(seed: int, begin: int, lo
 
 @given(st.lists(st.binary(max_size=1300), max_size=20))
 def test_any_bytes(packets: list[bytes]) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     assert feed_all(decoder, packets) == []
     assert decoder.bad_frames == len(packets)
     assert decoder.skipped_bytes == sum(map(len, packets))
@@ -288,11 +294,13 @@ HOSTILE_US = st.one_of(
 @settings(deadline=None)
 def test_any_numbers_and_times(headers: list[tuple[int, int, int]]) -> None:
     """Nothing breaks or grows, and each packet is accounted for."""
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = []
+    frames = decoder._slots
+    assert frames is not None
     for header in headers:
         scans += decoder.feed(packet(*header))
-        assert sum(scan is not None for scan in (decoder._older, decoder._newest, decoder._stray)) <= 3
+        assert sum(scan is not None for scan in (frames._older, frames._newest, frames._stray)) <= 3
     scans += decoder.finish()
     in_scans = sum(scan.packets_received for scan in scans)
     assert in_scans + decoder.duplicates + decoder.late + decoder.bad_frames == len(headers)
@@ -337,8 +345,8 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     net = Network()
 
     class SendsWhenBound(UdpLink):
-        def __init__(self, address: str, ports: tuple[int, ...]) -> None:
-            super().__init__(address, ports)
+        def __init__(self, address: str, ports: tuple[int, ...], **keys: Any) -> None:
+            super().__init__(address, ports, **keys)
             net.at_connect()
 
     monkeypatch.setattr(robosense, "UdpLink", SendsWhenBound)
@@ -498,7 +506,7 @@ def test_lidar_that_sends_elsewhere_says_where(network: Network) -> None:
 
 def test_another_model_is_not_taken_for_an_m1(network: Network) -> None:
     network.at_connect = lambda: network.send(bytes(1248))
-    with pytest.raises(DeviceError, match=r"1 datagrams came, of 1248 bytes, none is of an M1"):
+    with pytest.raises(DeviceError, match=r"1 datagrams came, of 1248 bytes, none is of a known model"):
         network.driver().connect()
 
 
