@@ -16,10 +16,13 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Protocol
 
+import numpy as np
 import serial
 
+from drivers.datagrams import SLOTS, BatchReceiver
 from drivers.device import DeviceError
 from drivers.samples import Chunk, DeviceEvent
 
@@ -137,6 +140,10 @@ class UdpLink:
         self._sockets: dict[int, socket.socket] = {}
         self._readable = select.poll()
         self._realtime_minus_monotonic_ns = _realtime_minus_monotonic_ns()
+        try:
+            self._batches: BatchReceiver | None = BatchReceiver()
+        except OSError:
+            self._batches = None
         bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not multicast_group else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
@@ -212,6 +219,50 @@ class UdpLink:
         return chunks
 
     def _drain(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
+        """Read what waits on one socket, by the batch where the system can."""
+        if self._batches is None or not isinstance(udp, socket.socket):
+            self._drain_singly(udp, offset_ns, chunks)
+            return
+        destination: tuple[str, int] = udp.getsockname()
+        for _ in range(0, DATAGRAMS_PER_READ, SLOTS):
+            try:
+                batch = self._batches.receive(udp)
+            except OSError as error:
+                if error.errno == errno.ECONNREFUSED:  # a late answer to something sent, not about what comes
+                    continue
+                raise DeviceError(f"UDP port {destination[1]}: {_reason(error)}") from error
+            if batch is None:
+                return
+            now_ns = time.monotonic_ns()
+            if batch.drops is not None:
+                self._count_kernel_drops(udp.fileno(), batch.drops)
+            arrivals_ns = batch.stamp_ns - (offset_ns or 0)
+            # A wall clock that was set in this very moment would show as the future or the far past.
+            is_credible = (arrivals_ns > now_ns - 10_000_000_000) & (arrivals_ns <= now_ns) & (offset_ns is not None)
+            stamps_ns = np.where(is_credible, arrivals_ns, now_ns).tolist()
+            for arrival_ns, data, number in zip(stamps_ns, batch.data, batch.source, strict=True):
+                self._accept(udp, arrival_ns, data, _source(number), destination, chunks)
+            if len(batch.data) < SLOTS:
+                return
+
+    def _accept(
+        self,
+        udp: socket.socket,
+        arrival_ns: int,
+        data: bytes,
+        source: tuple[str, int],
+        destination: tuple[str, int],
+        chunks: list[Chunk],
+    ) -> None:
+        """Put a datagram where it belongs."""
+        if self._shared and len(self._shared[udp.fileno()].links) > 1:
+            self._deal_out(udp, Chunk(arrival_ns, data, source, destination), chunks)
+        elif self.accepts(source):
+            chunks.append(Chunk(arrival_ns, data, source, destination))
+        else:
+            self.foreign += 1
+
+    def _drain_singly(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
         destination = udp.getsockname()
         for _ in range(DATAGRAMS_PER_READ):
             try:
@@ -232,24 +283,18 @@ class UdpLink:
                         arrival_ns = stamp_ns
                 elif kind == SO_RXQ_OVFL:
                     self._count_kernel_drops(udp.fileno(), _UINT32.unpack_from(payload)[0])
-            if self._shared:
-                self._deal_out(udp, Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination), chunks)
-            elif self.accepts(source):
-                chunks.append(Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination))
-            else:
-                self.foreign += 1
+            self._accept(udp, arrival_ns, bytes(self._buffer[:size]), source, destination, chunks)
 
     def _deal_out(self, udp: socket.socket, chunk: Chunk, chunks: list[Chunk]) -> None:
         """Give a datagram to all links that accept it; one that nobody accepts is foreign to the one that read it."""
         assert chunk.source is not None
-        links = self._shared[udp.fileno()].links
-        takers = [link for link in links if link.accepts(chunk.source)] if len(links) > 1 else [self]
-        self.foreign += not takers or (len(links) == 1 and not self.accepts(chunk.source))
+        takers = [link for link in self._shared[udp.fileno()].links if link.accepts(chunk.source)]
+        self.foreign += not takers
         for link in takers:
-            if link is not self:
-                link._given.append(chunk)  # noqa: SLF001
-            elif self.accepts(chunk.source):
+            if link is self:
                 chunks.append(chunk)
+            else:
+                link._given.append(chunk)  # noqa: SLF001
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
         seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket
@@ -292,6 +337,12 @@ class _SharedPort:
 
 _shared_ports: dict[tuple[str, int], _SharedPort] = {}
 _shared_ports_lock = threading.Lock()
+
+
+@lru_cache(maxsize=4096)
+def _source(number: int) -> tuple[str, int]:
+    """Address and port of one number."""
+    return socket.inet_ntoa((number >> 16).to_bytes(4)), number & 0xFFFF
 
 
 def _packed_ipv4(address: str) -> bytes:

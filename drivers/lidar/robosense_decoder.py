@@ -21,6 +21,7 @@ from drivers.lidar.models import (
     HELIOS16P,
     HELIOS32,
     MODELS,
+    SEQUENCED_MAGIC,
     Model,
     SequencedModel,
     SpinningModel,
@@ -75,7 +76,9 @@ class RobosenseDecoder(Counters):
         self.last_ticks: int | None = None
         self.bad: dict[str, int] = {}
         self.bad_frames = self.skipped_bytes = 0
+        self._has_layers = bool(self.options.user_layer_bytes or self.options.tail_layer_bytes)
         self._slots: SlotFrames | None = None
+        self._slot_bytes = self._crc_at = 0
         self._turns: TurnFrames | None = None
         self._setup: Setup | None = None
         self._waiting: deque[bytes] = deque()
@@ -99,13 +102,13 @@ class RobosenseDecoder(Counters):
 
     def feed(self, datagram: bytes) -> list[ScanSample]:
         """Take one datagram; gives the frames it closes."""
-        options = self.options
-        if options.user_layer_bytes or options.tail_layer_bytes:
+        if self._has_layers:
+            options = self.options
             datagram = datagram[options.user_layer_bytes : max(0, len(datagram) - options.tail_layer_bytes)]
-        self.last_ticks = None
         slots = self._slots
-        if slots is not None and len(datagram) == slots.model.packet_bytes and datagram.startswith(slots.model.magic):
+        if slots is not None and len(datagram) == self._slot_bytes and datagram.startswith(SEQUENCED_MAGIC):
             return self._feed_slots(slots, datagram)
+        self.last_ticks = None
         if is_difop(datagram):
             return self._take_difop(datagram)
         if is_airy_imu(datagram):
@@ -141,6 +144,7 @@ class RobosenseDecoder(Counters):
     def _begin_slots(self, model: SequencedModel) -> SlotFrames:
         options = self.options
         self.model = model
+        self._slot_bytes, self._crc_at = model.packet_bytes, model.crc_at
         points = PointDecoder(model, options.min_range_m, options.max_range_m)
         self._slots = SlotFrames(
             model,
@@ -154,8 +158,8 @@ class RobosenseDecoder(Counters):
         return self._slots
 
     def _feed_slots(self, slots: SlotFrames, datagram: bytes) -> list[ScanSample]:
-        crc_at = slots.model.crc_at
-        if crc_at and not self._crc_fits(datagram, crc_at):
+        if self._crc_at and not self._crc_fits(datagram, self._crc_at):
+            self.last_ticks = None
             return self._refuse(datagram, "crc")
         scans = slots.feed(datagram)
         self.last_ticks, self._last_packet = slots.last_ticks, datagram
