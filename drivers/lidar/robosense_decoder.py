@@ -84,7 +84,7 @@ class RobosenseDecoder(Counters):
         self._waiting: deque[bytes] = deque()
         self._crc_is_used = False
         self._last_packet = b""
-        self._is_helios = False
+        self._is_spinning = self._is_helios = False
         self._airy_variant = (96, False)
         if isinstance(model, SequencedModel):
             self._begin_slots(model)
@@ -183,13 +183,7 @@ class RobosenseDecoder(Counters):
         if not 0 <= ticks < SECONDS_LIMIT * 1_000_000:
             return self._refuse(datagram, "time")
         self.last_ticks, self._last_packet = ticks, datagram
-        scans: list[ScanSample] = []
-        if found in HELIOS:
-            self._is_helios = True
-        else:
-            self.model = found
-        if self._setup is None and self.difop:
-            scans = self._take_difop(self.difop)
+        scans = self._meet_spinning(found) if not self._is_spinning else []
         if found is AIRY:
             variant = (48 if datagram[32] == AIRY_48_LASERS else 96, datagram[17] == AIRY_DUAL)
             if variant != self._airy_variant:
@@ -201,6 +195,16 @@ class RobosenseDecoder(Counters):
             self._refuse(self._waiting.popleft(), "uncalibrated")
         self._waiting.append(datagram)
         return scans
+
+    def _meet_spinning(self, found: SpinningModel) -> list[ScanSample]:
+        """The first packet tells the model, but for a Helios."""
+        self._is_spinning = True
+        is_new = self.model is None
+        if found in HELIOS:
+            self._is_helios = True
+        else:
+            self.model = found
+        return self._take_difop(self.difop) if is_new and self.difop else []
 
     def _begin_turns(self) -> list[ScanSample]:
         """Frames with the setup there is now; gives those of the one before."""
