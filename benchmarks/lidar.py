@@ -103,6 +103,7 @@ def send(msop_port: int, difop_port: int, multiple: float, duration_s: float) ->
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind((LIDAR, 0))
         udp.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, M1.packet_bytes)
+        print("ready", flush=True)
         begin_s = time.monotonic()
         sent = 0
         for frame in range(round(duration_s * rate_hz)):
@@ -124,6 +125,8 @@ def send(msop_port: int, difop_port: int, multiple: float, duration_s: float) ->
 def sender(ports: tuple[int, int], multiple: float, duration_s: float) -> Iterator[subprocess.Popen[str]]:
     arguments = ["--send", *map(str, ports), str(multiple), str(duration_s)]
     with subprocess.Popen([sys.executable, __file__, *arguments], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
         try:
             yield process
         finally:

@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 SLOTS = 256
-SLOT_BYTES = 65536 + 2112
-"""Room for any datagram, each at another place of the cache. Memory is used only where one was written."""
+SLOT_BYTES = 2048
+REST_BYTES = 65536 - SLOT_BYTES
+"""A datagram lies in a slot, which the cache holds; the rest of a long one elsewhere, in memory used only then."""
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 MSG_DONTWAIT = 0x40
@@ -65,16 +66,19 @@ class BatchReceiver:
         except AttributeError as error:
             raise OSError(errno.ENOSYS, "recvmmsg is missing") from error
         self._memory = mmap.mmap(-1, SLOTS * SLOT_BYTES)
+        self._rests = mmap.mmap(-1, SLOTS * REST_BYTES)
         self._names = np.zeros(SLOTS, _NAME)
         self._controls = np.zeros(SLOTS, _CONTROL)
-        vectors = np.zeros(SLOTS, _VECTOR)
-        vectors["base"] = np.frombuffer(self._memory, np.uint8).ctypes.data + SLOT_BYTES * np.arange(SLOTS)
-        vectors["bytes"] = 65536
+        vectors = np.zeros((SLOTS, 2), _VECTOR)
+        for part, (memory, size) in enumerate(((self._memory, SLOT_BYTES), (self._rests, REST_BYTES))):
+            begin = np.frombuffer(memory, np.uint8).ctypes.data
+            vectors[:, part]["base"] = begin + size * np.arange(SLOTS)
+            vectors[:, part]["bytes"] = size
         self._vectors = vectors
         self._messages = messages = np.zeros(SLOTS, _MESSAGE)
         for key, array in (("name", self._names), ("vector", vectors), ("control", self._controls)):
-            messages[key] = array.ctypes.data + array.itemsize * np.arange(SLOTS)
-        messages["vectors"] = 1
+            messages[key] = array.ctypes.data + array.strides[0] * np.arange(SLOTS)
+        messages["vectors"] = 2
 
     def receive(self, udp: socket.socket) -> Batch | None:
         """What waits, up to SLOTS datagrams; None when nothing does. Raises OSError."""
@@ -87,8 +91,6 @@ class BatchReceiver:
             if code == errno.EAGAIN:
                 return None
             raise OSError(code, os.strerror(code))
-        memory, starts = self._memory, range(0, count * SLOT_BYTES, SLOT_BYTES)
-        sizes = messages["bytes"][:count].tolist()
         controls = self._controls[:count]
         filled = messages["control_bytes"][:count]
         is_stamp = (controls["level"] == socket.SOL_SOCKET) & (controls["kind"] == SO_TIMESTAMPNS) & (filled >= 32)
@@ -98,8 +100,20 @@ class BatchReceiver:
         tells_drops = (filled >= 52) & (controls["second_kind"] == SO_RXQ_OVFL)
         told = np.flatnonzero(tells_drops & (controls["second_level"] == socket.SOL_SOCKET))
         return Batch(
-            data=[memory[start : start + size] for start, size in zip(starts, sizes, strict=True)],
+            data=self._data(count),
             stamp_ns=stamp_ns,
             source=source.tolist(),
             drops=int(controls["drops"][told[-1]]) if len(told) else None,
         )
+
+    def _data(self, count: int) -> list[bytes]:
+        memory, starts = self._memory, range(0, count * SLOT_BYTES, SLOT_BYTES)
+        sizes = self._messages["bytes"][:count].tolist()
+        data = [memory[start : start + size] for start, size in zip(starts, sizes, strict=True)]
+        if max(sizes) <= SLOT_BYTES:
+            return data
+        for number, size in enumerate(sizes):
+            if size > SLOT_BYTES:
+                rest, start = number * REST_BYTES, number * SLOT_BYTES
+                data[number] = memory[start : start + SLOT_BYTES] + self._rests[rest : rest + size - SLOT_BYTES]
+        return data

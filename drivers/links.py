@@ -17,6 +17,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import repeat
 from typing import Protocol
 
 import numpy as np
@@ -224,6 +225,7 @@ class UdpLink:
             self._drain_singly(udp, offset_ns, chunks)
             return
         destination: tuple[str, int] = udp.getsockname()
+        is_alone = udp.fileno() not in self._shared or len(self._shared[udp.fileno()].links) == 1
         for _ in range(0, DATAGRAMS_PER_READ, SLOTS):
             try:
                 batch = self._batches.receive(udp)
@@ -240,8 +242,12 @@ class UdpLink:
             # A wall clock that was set in this very moment would show as the future or the far past.
             is_credible = (arrivals_ns > now_ns - 10_000_000_000) & (arrivals_ns <= now_ns) & (offset_ns is not None)
             stamps_ns = np.where(is_credible, arrivals_ns, now_ns).tolist()
-            for arrival_ns, data, number in zip(stamps_ns, batch.data, batch.source, strict=True):
-                self._accept(udp, arrival_ns, data, _source(number), destination, chunks)
+            first = _source(batch.source[0])
+            if is_alone and len(set(batch.source)) == 1 and self.accepts(first):
+                chunks += map(Chunk, stamps_ns, batch.data, repeat(first), repeat(destination))
+            else:
+                for arrival_ns, data, number in zip(stamps_ns, batch.data, batch.source, strict=True):
+                    self._accept(udp, arrival_ns, data, _source(number), destination, chunks)
             if len(batch.data) < SLOTS:
                 return
 

@@ -1,6 +1,6 @@
 """RoboSense lidars over UDP: measurement packets (MSOP) on one port, information packets (DIFOP) on another.
 
-Datagrams wait in the socket's buffer for a few milliseconds and are then taken together: one wake-up for some twenty
+Datagrams wait in the socket's buffer for a few milliseconds and are then taken together: one wake-up for some sixty
 of them, while each keeps the kernel's time of its arrival.
 """
 
@@ -26,7 +26,9 @@ FIRST_PACKET_S = 3.0
 DIFOP_PERIOD_S = 1.1
 """Most lidars tell of themselves once a second, an M1P ten times."""
 HELD_DATAGRAMS = 30_000
-COLLECT_S = 0.004
+COLLECT_S = 0.010
+"""Datagrams are taken together after so long, or after a quarter of what the socket's buffer holds."""
+PAIRS_EVERY_NS = 50_000_000
 BATCH_DATAGRAMS = 512
 TAPE_BYTES_PER_PACKET = 60
 PACKET_SOCKET_BYTES = 2304
@@ -96,6 +98,8 @@ class RobosenseDriver:
         )
         self._decoder = RobosenseDecoder()
         self._held: list[Chunk] = []
+        self._ticks: list[int] = []
+        self._ticks_arrivals_ns: list[int] = []
 
     @property
     def identity(self) -> dict[str, str]:
@@ -111,7 +115,7 @@ class RobosenseDriver:
         """Open the ports and wait for the first measurement packet. Raises DeviceError with what to check."""
         self.close()
         self._link = link = self._open()
-        self._held = []
+        self._held, self._ticks, self._ticks_arrivals_ns = [], [], []
         try:
             model, difop, self._connect_events = self._meet(link)
         except DeviceError:
@@ -148,7 +152,9 @@ class RobosenseDriver:
         difop = self._wait_for(link, is_difop, DIFOP_PERIOD_S)
         model = self._agreed_model(found, self._packet(difop) if difop is not None else b"")
         is_dual = isinstance(model, SequencedModel) and data[8] == DUAL_RETURN
-        events = _buffer_advice(link, model, is_dual=is_dual)
+        held_s = link.receive_buffer_bytes / (model.packets_per_s * (2 if is_dual else 1) * PACKET_SOCKET_BYTES)
+        self._collect_s = min(COLLECT_S, held_s / 4)
+        events = _buffer_advice(held_s)
         if difop is None:
             text = f"no information packet on UDP port {config.difop_port}"
             if isinstance(model, SpinningModel):
@@ -211,21 +217,22 @@ class RobosenseDriver:
         assert link is not None
         yield Received(events=tuple(self._connect_events))
         yield from self._backlog(link)
-        last_packet_ns = time.monotonic_ns()
+        last_packet_ns, last_arrival_ns = time.monotonic_ns(), self._last_arrival_ns
         while not stop.is_set():
             chunks = link.read(0.1)
             now_ns = time.monotonic_ns()
             received = self._take(chunks, now_ns)
             if received.chunks or received.events:
                 yield received
-            if any(isinstance(sample, ClockPairs) for _, sample in received.samples):
-                last_packet_ns = now_ns
+            if self._last_arrival_ns != last_arrival_ns:
+                last_packet_ns, last_arrival_ns = now_ns, self._last_arrival_ns
             elif now_ns - last_packet_ns > SILENCE_S * 1e9:
                 break
             if 0 < len(chunks) < BATCH_DATAGRAMS:
-                time.sleep(COLLECT_S)
+                time.sleep(self._collect_s)
+        last_scans = [(self._last_arrival_ns, scan) for scan in self._decoder.finish()]
         yield Received(
-            samples=tuple((self._last_arrival_ns, scan) for scan in self._decoder.finish()),
+            samples=(*self._pairs(), *last_scans),
             events=self._losses.events(time.monotonic_ns()),
         )
         if not stop.is_set():
@@ -245,9 +252,7 @@ class RobosenseDriver:
     def _take(self, chunks: list[Chunk], now_ns: int) -> Received:
         """Decode a batch: first its clock pairs, so that its frames can be placed in time."""
         scans: list[tuple[int, ScanSample]] = []
-        ticks: list[int] = []
-        arrivals_ns: list[int] = []
-        decoder = self._decoder
+        decoder, ticks, arrivals_ns = self._decoder, self._ticks, self._ticks_arrivals_ns
         for chunk in chunks:
             for scan in decoder.feed(chunk.data):
                 scans.append((chunk.arrival_ns, scan))
@@ -255,12 +260,21 @@ class RobosenseDriver:
                 ticks.append(decoder.last_ticks)
                 arrivals_ns.append(chunk.arrival_ns)
         samples: list[tuple[int, Sample]] = []
-        if ticks:
+        if arrivals_ns:
             self._last_arrival_ns = arrivals_ns[-1]
-            samples.append((arrivals_ns[0], ClockPairs(np.array(ticks, np.int64), np.array(arrivals_ns, np.int64))))
+            if scans or now_ns - arrivals_ns[0] >= PAIRS_EVERY_NS:
+                samples += self._pairs()
         samples += scans
         events = self._losses.events(now_ns) + self._bad_packets.events(now_ns) + self._setup_changes.events()
         return Received(tuple(chunks), tuple(samples), events)
+
+    def _pairs(self) -> list[tuple[int, ClockPairs]]:
+        """The clock pairs since the last ones."""
+        ticks, arrivals_ns = self._ticks, self._ticks_arrivals_ns
+        if not ticks:
+            return []
+        self._ticks, self._ticks_arrivals_ns = [], []
+        return [(arrivals_ns[0], ClockPairs(np.array(ticks, np.int64), np.array(arrivals_ns, np.int64)))]
 
     def close(self) -> None:
         """Release the ports."""
@@ -275,12 +289,10 @@ def _bytes_per_s(model: Model) -> float:
     return model.packets_per_s * (point_bytes + model.packet_bytes + TAPE_BYTES_PER_PACKET)
 
 
-def _buffer_advice(link: UdpLink, model: Model, *, is_dual: bool) -> list[DeviceEvent]:
+def _buffer_advice(held_s: float) -> list[DeviceEvent]:
     """A warning when the socket's buffer cannot hold a second of data."""
-    needed = round(model.packets_per_s * (2 if is_dual else 1) * PACKET_SOCKET_BYTES)
-    if link.receive_buffer_bytes >= needed:
+    if held_s >= 1.0:
         return []
-    held_s = link.receive_buffer_bytes / needed
     advice = "allow more with: sysctl -w net.core.rmem_max=33554432"
     return [DeviceEvent("warning", f"the receive buffer holds only {held_s:.2f} s of this lidar's data; {advice}")]
 
