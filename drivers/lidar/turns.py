@@ -23,6 +23,8 @@ REORDER_PACKETS = 20
 FAR_US = 1_000_000
 """A packet so far from the last one is held until the next tells whether time went on."""
 LONGEST_OUTAGE_US = 60_000_000
+BACK_STEP = 4500
+"""An azimuth smaller by less than this is a rotor that trembles, by more than this a new turn (0.01 deg)."""
 TICKS_REMEMBERED = 4096
 
 
@@ -161,7 +163,7 @@ class TurnFrames:
         turn.ticks.append(ticks)
         turn.begun += 1
         for group, (before, after) in enumerate(pairwise(past_cut), 1):
-            if before - after > TURN // 2 and self._may_cut(turn, ticks):
+            if before - after > BACK_STEP and self._may_cut(turn, ticks):
                 block = group * self._points.blocks_together
                 scans += self._close(turn, block)
                 turn = _Turn(True, [datagram], [ticks], first_block=block)
@@ -187,7 +189,7 @@ class TurnFrames:
         if missing:
             elapsed = (ticks - last_ticks) / self._turn_us * TURN
             advance += max(0, round((elapsed - advance) / TURN)) * TURN
-        turns = (self._last_azimuth + advance) // TURN if missing or advance < TURN // 2 else 0
+        turns = (self._last_azimuth + advance) // TURN if missing or advance < TURN - BACK_STEP else 0
         begins = self._last_azimuth + advance * np.arange(1, missing + 1) / (missing + 1)
         in_turn = np.bincount((begins // TURN).astype(np.int64), minlength=turns + 1)
         turn.missing += int(in_turn[0])
