@@ -104,10 +104,13 @@ def driver_type(name: str) -> DriverType:
     raise KeyError(name)
 
 
-def received(driver: Driver, stop: Event, *, connected: bool) -> Iterator[Received]:
+def received(
+    driver: Driver, stop: Event, *, connected: bool, wait: Callable[[float], object] | None = None
+) -> Iterator[Received]:
     """Yield what a device sends until `stop` is set, taking it up again whenever it was lost.
 
     It is told as connected with its first data: a port that can be opened but stays silent is no news.
+    wait: how to let so many seconds pass before the next attempt (default: until `stop` is set).
     """
     is_present = connected
     told: set[str] = set()  # of one absence: an event for each cause, not for each attempt
@@ -129,7 +132,7 @@ def received(driver: Driver, stop: Event, *, connected: bool) -> Iterator[Receiv
                     told.add(text)
                     yield Received(events=(DeviceEvent("lost" if is_present else "warning", text),))
                 is_present = False
-                stop.wait(RETRY_S)
+                (wait or stop.wait)(RETRY_S)
     finally:
         driver.close()
 

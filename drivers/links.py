@@ -2,6 +2,9 @@
 
 Arrival is in nanoseconds of the host's monotonic clock. A serial line has no kernel stamp, so the clock is read right
 after the bytes; a datagram carries the kernel's stamp of its reception.
+
+A driver opens its link and asks for the time through `Links`, its attribute `links`: LIVE, or a capture that is played
+instead of the device (drivers.captures).
 """
 
 import contextlib
@@ -18,14 +21,29 @@ from collections import deque
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import repeat
-from typing import Protocol
 
 import numpy as np
 import serial
 
-from drivers.datagrams import SLOTS, BatchReceiver
 from drivers.device import DeviceError
-from drivers.samples import Chunk, DeviceEvent
+from drivers.garbage import CountsBadInput, GarbageWatch
+from drivers.ports import Links, SerialPort, UdpOptions, UdpPorts
+from drivers.samples import Chunk
+from drivers.udp_batches import SLOTS, BatchReceiver
+
+__all__ = [
+    "LIVE",
+    "SILENCE_S",
+    "CountsBadInput",
+    "GarbageWatch",
+    "Links",
+    "LiveLinks",
+    "SerialLink",
+    "SerialPort",
+    "UdpLink",
+    "UdpOptions",
+    "UdpPorts",
+]
 
 READ_BYTES = 65536
 DATAGRAM_BYTES = 65535
@@ -35,8 +53,6 @@ RECEIVE_BUFFER_BYTES = 32 << 20
 SILENCE_S = 3.0
 WRITE_TIMEOUT_S = 2.0
 WALL_CLOCK_STEP_NS = 1_000_000
-BURST_END_NS = 1_000_000_000
-BURST_MAX_NS = 10_000_000_000
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
@@ -115,24 +131,11 @@ class UdpLink:
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
-    def __init__(
-        self,
-        address: str,
-        ports: tuple[int, ...],
-        *,
-        source_port: int = 0,
-        multicast_group: str = "",
-        interface: str = "",
-        shared: bool = False,
-    ) -> None:
-        """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address.
-
-        source_port: the device's own port, 0: any. multicast_group: joined on the interface with this host's address
-        `interface` (empty: as the system chooses). shared: other links of this process may use the same ports, each
-        for its own device (or for its own part of what that device sends there).
-        """
+    def __init__(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> None:
+        """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address."""
+        options = options or UdpOptions()
         self.address = address
-        self.source_port = source_port
+        self.source_port = options.source_port
         self.foreign = 0
         self._given: deque[Chunk] = deque(maxlen=GIVEN_DATAGRAMS)
         self._shared: dict[int, _SharedPort] = {}
@@ -145,14 +148,14 @@ class UdpLink:
             self._batches: BatchReceiver | None = BatchReceiver()
         except OSError:
             self._batches = None
-        bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not multicast_group else "0.0.0.0"
+        bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not options.multicast_group else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
-            udp = self._share(bind_address, port) if shared else self._bind(bind_address, port)
+            udp = self._share(bind_address, port) if options.shared else self._bind(bind_address, port)
             self._sockets[udp.fileno()] = udp
             self._readable.register(udp, select.POLLIN)
-            if multicast_group:
-                self._join(udp, multicast_group, interface)
+            if options.multicast_group:
+                self._join(udp, options.multicast_group, options.interface)
         self.receive_buffer_bytes = min(
             bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for bound in self._sockets.values()
         )
@@ -358,39 +361,31 @@ def _packed_ipv4(address: str) -> bytes:
         raise DeviceError(f"address {address!r}: not an IPv4 address") from error
 
 
-class CountsBadInput(Protocol):
-    """A decoder: it counts what it could not use."""
+class LiveLinks:
+    """Real devices and real time."""
 
-    bad_frames: int
-    skipped_bytes: int
+    def serial(self, port: str, baud: int) -> SerialPort:
+        """Open a serial port. Raises DeviceError."""
+        return SerialLink(port, baud)
+
+    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
+        return UdpLink(address, ports, options)
+
+    def monotonic_ns(self) -> int:
+        """The host's monotonic clock."""
+        return time.monotonic_ns()
+
+    def utc_ns(self) -> int:
+        """The host's wall clock."""
+        return time.time_ns()
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass."""
+        time.sleep(duration_s)
 
 
-@dataclass(slots=True)
-class GarbageWatch:
-    """Turns a decoder's counters of bad input into one event per burst (ended by a second without any).
-
-    A burst that does not end is told every ten seconds.
-    """
-
-    decoder: CountsBadInput
-    _reported: tuple[int, int] = (0, 0)
-    _seen: tuple[int, int] = (0, 0)
-    _begin_ns: int = 0
-    _last_growth_ns: int = 0
-
-    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
-        """The event of a burst that is over, else nothing."""
-        counters = (self.decoder.bad_frames, self.decoder.skipped_bytes)
-        if counters != self._seen:
-            if self._seen == self._reported:
-                self._begin_ns = now_ns
-            self._seen, self._last_growth_ns = counters, now_ns
-        is_over = now_ns - self._last_growth_ns >= BURST_END_NS or now_ns - self._begin_ns >= BURST_MAX_NS
-        if self._seen == self._reported or not is_over:
-            return ()
-        frames, skipped = (new - old for new, old in zip(self._seen, self._reported, strict=True))
-        self._reported = self._seen
-        return (DeviceEvent("garbage", f"{frames} bad frames, {skipped} bytes skipped", frames or skipped),)
+LIVE: Links = LiveLinks()
 
 
 def _realtime_minus_monotonic_ns() -> int:

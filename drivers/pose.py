@@ -6,7 +6,6 @@ One datagram is one object, times in microseconds of the sender's clock, z up, `
 """
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from threading import Event
@@ -16,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
-from drivers.links import SILENCE_S, GarbageWatch, UdpLink
+from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, UdpPorts
 from drivers.samples import Chunk, DeviceEvent, PoseSample, Received, Sample, Vector
 
 FIRST_POSE_S = 3.0
@@ -87,9 +86,10 @@ class PoseDriver:
 
     def __init__(self, name: str, config: PoseConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
         self.streams = (StreamSpec("pose", config.rate_hz, BYTES_PER_POSE * config.rate_hz),)
-        self._link: UdpLink | None = None
+        self._link: UdpPorts | None = None
 
     @property
     def identity(self) -> dict[str, str]:
@@ -100,16 +100,16 @@ class PoseDriver:
         """Open the port and wait for a first datagram. Raises DeviceError with what to check."""
         config = self._config
         self.close()
-        self._link = link = UdpLink(config.address, (config.port,))
+        self._link = link = self.links.udp(config.address, (config.port,))
         self._decoder = PoseDecoder()
         self._garbage = GarbageWatch(self._decoder)
         self._last_sequence: int | None = None
         self._kernel_drops = self._foreign = 0
         self._last_foreign_ns = -FOREIGN_QUIET_NS
-        deadline_s = time.monotonic() + FIRST_POSE_S
+        deadline_ns = self.links.monotonic_ns() + int(FIRST_POSE_S * 1e9)
         self._held: list[Chunk] = []
-        while not self._held and (left_s := deadline_s - time.monotonic()) > 0:
-            self._held = link.read(left_s)
+        while not self._held and (left_ns := deadline_ns - self.links.monotonic_ns()) > 0:
+            self._held = link.read(left_ns / 1e9)
         if not self._held:
             self.close()
             raise DeviceError(
@@ -123,9 +123,9 @@ class PoseDriver:
         link = self._link
         assert link is not None
         chunks, self._held = self._held, []
-        last_chunk_ns = time.monotonic_ns()
+        last_chunk_ns = self.links.monotonic_ns()
         while not stop.is_set():
-            now_ns = time.monotonic_ns()
+            now_ns = self.links.monotonic_ns()
             received = self._take(link, chunks, now_ns)
             if received.chunks or received.events:
                 yield received
@@ -135,7 +135,7 @@ class PoseDriver:
                 raise DeviceError(f"{self._config.address}: no pose for {SILENCE_S:.0f} s")
             chunks = link.read(0.1)
 
-    def _take(self, link: UdpLink, chunks: list[Chunk], now_ns: int) -> Received:
+    def _take(self, link: UdpPorts, chunks: list[Chunk], now_ns: int) -> Received:
         samples: list[tuple[int, Sample]] = []
         events: list[DeviceEvent] = []
         for chunk in chunks:
@@ -158,7 +158,7 @@ class PoseDriver:
             events.append(DeviceEvent("gap", f"{step - 1} poses lost before sequence {pose.sequence}", step - 1))
         return step != 0
 
-    def _link_events(self, link: UdpLink, now_ns: int) -> list[DeviceEvent]:
+    def _link_events(self, link: UdpPorts, now_ns: int) -> list[DeviceEvent]:
         """Drops of the kernel (they are also missing in the sequence, so not counted again), and foreign senders."""
         events: list[DeviceEvent] = []
         if drops := link.kernel_drops - self._kernel_drops:

@@ -15,8 +15,10 @@ from types import FrameType
 
 import click
 from rich.console import Console
+from rich.progress import Progress
 
 from recorder import simulation
+from recorder.decode import decode as decode_capture
 from recorder.errors import ConfigError, RecorderError
 from recorder.recording.check import check as check_recording
 from recorder.recording.check import print_report
@@ -24,7 +26,7 @@ from recorder.recording.info import info as recording_info
 from recorder.recording.info import print_info
 from recorder.rig import Rig, load_rig, parse_rig
 from recorder.session import record as record_take
-from recorder.status import StatusDisplay, print_summary
+from recorder.status import DecodeProgress, StatusDisplay, print_summary
 
 RigFile = click.Path(exists=True, dir_okay=False, path_type=Path)
 Folder = click.Path(file_okay=False, path_type=Path)
@@ -164,6 +166,45 @@ def simulate(rig: Path | None, ideal: Path | None, duration: float | None, setti
 
 
 @main.command()
+@click.argument("capture", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--driver", required=True, help="Driver of the device that was captured (xsens, nmea, robosense, ...).")
+@click.option("-o", "--output", type=Folder, required=True, help="Folder of the recording; empty or not there yet.")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a key of the device (repeatable).")
+@click.pass_obj
+def decode(verbose: bool, capture: Path, driver: str, output: Path, settings: tuple[str, ...]) -> None:
+    """Make a recording of CAPTURE, through the driver that would have recorded the device.
+
+    CAPTURE is a pcap or pcapng (a raw tape, Wireshark, tcpdump) or plain bytes of a serial line (.bin, .nmea, .log).
+    Exit code 1 when it could not be read to its end; what could be read is in OUTPUT then.
+
+    \b
+    Examples:
+      rigtape decode lidar.pcap --driver robosense -o drive
+      rigtape decode lidars.pcap --driver robosense --set address=192.168.1.201 --set msop_port=6700 -o front
+      rigtape decode imu.bin --driver xsens -o imu
+      rigtape decode demo/2026-11-22T10-00-00Z/raw/gnss.pcapng --driver nmea -o again
+    """
+    console = Console()
+    stop = _stop_on_signals(console)
+    with clear_errors(verbose), DecodeProgress(console) as display:
+        decoded = decode_capture(
+            capture,
+            driver,
+            settings,
+            output,
+            stop=stop,
+            on_progress=lambda source: display.show(source.position, source.size),
+            on_event=display.event,
+        )
+    print_summary(console, decoded.manifest)
+    console.print(f"{decoded.manifest.duration_s:.1f} s decoded into {decoded.folder}", soft_wrap=True)
+    console.print(f"next: rigtape check {decoded.folder}", soft_wrap=True)
+    if decoded.fault:
+        click.echo(f"rigtape: {decoded.fault}; what comes before is in {decoded.folder}", err=True)
+        sys.exit(1)
+
+
+@main.command()
 @click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.pass_obj
@@ -196,8 +237,9 @@ def check(verbose: bool, recording: Path, as_json: bool, deep: bool) -> None:
     Example:
       rigtape check demo/2026-11-22T10-00-00Z
     """
-    with clear_errors(verbose):
-        report = check_recording(recording, deep=deep)
+    with clear_errors(verbose), Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(f"reading {recording}", total=1.0)
+        report = check_recording(recording, deep=deep, progress=lambda done: bar.update(task, completed=done))
     if as_json:
         click.echo(report.to_json())
     else:

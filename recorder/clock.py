@@ -22,7 +22,7 @@ from typing import Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_estimator import LATE_NS, PERSISTS_NS, Estimator, Ints, S
+from recorder.clock_estimator import KEPT_SKEW_PPM, LATE_NS, PERSISTS_NS, Estimator, Ints, S
 from recorder.clock_fit import PPM, SlopePrior
 from recorder.clock_refine import refine_epoch
 
@@ -30,6 +30,7 @@ FAR = 1 << 61  # ticks and device times beyond this are garbage
 STEP_BACK_NS = 1 * S  # less is reordering
 SUSPECTS = 3  # this many consistent samples prove a restart
 MIN_BATCH = 32  # smaller ones are not worth numpy
+TWO_WAY_KEPT = 64
 NEVER_NS = -(1 << 63)
 
 
@@ -58,6 +59,11 @@ class ClockStream:
         self._stamp_ns = NEVER_NS
         self._suspects: list[tuple[int, int]] = []
         self._late_since: tuple[int, float] | None = None
+
+    @property
+    def tick_ns(self) -> float:
+        """One tick."""
+        return self._num / self._den
 
     def map(self, ticks: int, arrival_ns: int) -> int:
         """Host time of one event: learn from it, then answer."""
@@ -298,6 +304,7 @@ class ClockMap:
         self._estimator = Estimator(prior, inline_refit, level, use_grid)
         self._stream = ClockStream(self._estimator, tick_hz, wrap_bits)
         self.map = self._stream.map
+        self._two_way: list[tuple[int, int]] = []  # round trip, stamp minus its middle
 
     def stream(self, tick_hz: float, wrap_bits: int = 0) -> ClockStream:
         """Another stream of the same device clock, with ticks of its own."""
@@ -313,11 +320,37 @@ class ClockMap:
             return self._estimator.host_many(device_ns)
         return self._estimator.host_ns(device_ns)
 
+    def observe_two_way(self, ticks: int, sent_ns: int, received_ns: int) -> None:
+        """A query sent and its answer received with the device's ticks in between: bounds from both sides.
+
+        Does not move the stamps; tells how late they are by the least delay of the link (`floor_ns`).
+        """
+        if self._estimator.started and received_ns >= sent_ns:
+            late_ns = self.host_ns(self._stream.unwrap(ticks)) - (sent_ns + received_ns) // 2
+            self._two_way = [*self._two_way, (received_ns - sent_ns, late_ns)][-TWO_WAY_KEPT:]
+
+    @property
+    def floor_ns(self) -> int | None:
+        """How much later the stamps are than the events, from two-way pairs; None without any.
+
+        The pairs with the shortest round trips count, like the best probes of NTP (RFC 5905, section 10).
+        """
+        shortest = min(self._two_way, default=None)
+        if shortest is None:
+            return None
+        return round(float(np.median([late for trip, late in self._two_way if trip <= 1.2 * shortest[0]])))
+
+    @property
+    def floor_bound_ns(self) -> int | None:
+        """`floor_ns` cannot be further off than this, the line's own uncertainty apart: half a round trip."""
+        return min(self._two_way)[0] // 2 if self._two_way else None
+
     def host_suspended(self, duration_ns: int) -> None:
         """The host slept: its monotonic clock stood still for `duration_ns` while the device ran on."""
         if self._estimator.started and duration_ns > 0:
             self._estimator.counts.suspends += 1
             self._estimator.begin_epoch(-duration_ns)
+            self._two_way = []
 
     @property
     def refit_due(self) -> bool:
@@ -336,7 +369,7 @@ class ClockMap:
     @property
     def uncertainty_ns(self) -> float:
         """One sigma of the stamps given now, apart from the constant floor of the delay."""
-        return self._estimator.sigma_ns()
+        return math.hypot(self._estimator.sigma_ns(), 0.5 * self._stream.tick_ns)
 
     @property
     def skew_ppm(self) -> float:
@@ -382,6 +415,16 @@ class ClockMap:
     def rejected(self) -> int:
         """Samples with impossible ticks, stamped with their arrival."""
         return self._estimator.counts.rejected
+
+
+def stored_sigma_ppm(sigma_ppm: float, age_s: float) -> float:
+    """What a skew stored with `sigma_ppm` is worth after `age_s`: crystals follow temperature within minutes, and age.
+
+    For `ClockMap(prior_skew_ppm=..., prior_sigma_ppm=stored_sigma_ppm(...))`.
+    """
+    temperature_ppm = min(0.03 * max(age_s, 0.0), 5.0)
+    ageing_ppm = max(age_s, 0.0) / (30 * 86_400)
+    return min(math.hypot(max(sigma_ppm, KEPT_SKEW_PPM), temperature_ppm, ageing_ppm), 100.0)
 
 
 def refine(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0) -> Ints:

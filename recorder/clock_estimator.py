@@ -26,8 +26,10 @@ BUCKET_S = (0.05, 1.0, 5.0)  # shortest, usual, longest when samples are few
 BUCKET_SHARE = 0.1  # of the epoch's age while it is young
 BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
-IGNORE_TRUST, MIN_TRUST = 0.01, 0.5
+IGNORE_TRUST, MIN_TRUST = 0.3, 0.5
 GRID_LEVEL = 0.02  # of the mean delay: what the place by the delay law may be wrong by
+LAW_ERROR = 0.02  # of the mean delay times the law's shape: one sigma of the place of the floor under a fitted law
+CLEARANCE_ERROR = 0.6  # of the height above the place by the delay law
 GRID_LEVEL_S = 120  # the grid's curve is put on the lowest point of this last time
 REFIT_S = 2.0
 SLEW = ((5.0, 0.2), (30.0, 5e-3), (math.inf, 500 * PPM))  # up to this age of the epoch: seconds per second
@@ -106,7 +108,10 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x
     here = trust * float(grid.at(np.array([now_x]))[0]) + (1 - trust) * line.at(now_x) + clearance
     slope = trust * (grid.slope + 2 * grid.curvature * (now_x - grid.pivot_x)) + (1 - trust) * line.slope
     sd_slope = trust * grid.sd_slope + (1 - trust) * line.sd_slope
-    sd_level = trust * grid.sd_height + (1 - trust) * line.sigma_ns(now_x)
+    unsure = math.hypot(
+        grid.sd_height, LAW_ERROR * grid.law.shape * grid.law.mean_ns, CLEARANCE_ERROR * max(clearance, 0.0)
+    )
+    sd_level = trust * unsure + (1 - trust) * line.sigma_ns(now_x)
     return Line(here - slope * now_x, slope, sd_slope, sd_level, now_x, line.spread_ns)
 
 
@@ -299,7 +304,9 @@ class Estimator:
         self.refit_due = False
         epoch, buckets, prior = self.epoch, self._buckets[:], self._prior
         if buckets:
-            line = blend(buckets, prior)
+            line = blend(buckets, prior, self.grid.period_ns if self.grid is not None else 0.0)
+            if self.grid is not None:
+                line = line.less_sure(self.grid.unseen_ns(self._age_s()))
             self.grid_line = self.grid.fit(line, prior) if self.grid is not None else None
             if self.grid_line is not None:
                 line = combine(line, self.grid_line, buckets, self.level, self.last_x)

@@ -68,6 +68,10 @@ class Line:
         """The same line, moved down (by a negative number)."""
         return replace(self, offset=self.offset + by_ns)
 
+    def less_sure(self, sigma_ns: float) -> Line:
+        """The same line with another error of its height."""
+        return replace(self, sd_level_ns=math.hypot(self.sd_level_ns, sigma_ns))
+
     def sigma_ns(self, x: float) -> float:
         """One sigma of the height at x."""
         return math.hypot(self.sd_level_ns, self.sd_slope * (x - self.pivot_x))
@@ -85,7 +89,8 @@ def summarise(x: Floats, y: Floats, slope: float) -> Bucket:
     """Condense samples into one bucket; heights are compared along `slope`."""
     height = y - slope * (x - x[0])
     low = int(np.argmin(height))
-    quarter, half, most = np.quantile(height, (0.25, 0.5, 0.75)) if height.size > 1 else (height[0],) * 3
+    order = np.sort(height)
+    quarter, half, most = (float(order[int(share * order.size)]) for share in (0.25, 0.5, 0.75))
     clipped = np.minimum(height, half + CLIP * max(most - quarter, half - height[low]))
     mean_x = float(x.mean())
     mean_y = float(clipped.mean()) + slope * (mean_x - float(x[0]))
@@ -154,27 +159,28 @@ def mean_slope(x: Floats, y: Floats, sd: Floats) -> tuple[float, float]:
     return slope, sigma * math.sqrt(x.size / min(x.size, 2 * runs))
 
 
-def blend(buckets: list[Bucket], prior: SlopePrior) -> Line:
+def blend(buckets: list[Bucket], prior: SlopePrior, period_ns: float = 0.0) -> Line:
     """Best line under the buckets: prior, means and hull edge weighed by their variances, level by the lowest.
 
     The means dither a polled link's quantisation away but follow the load; the hull edge does the opposite.
+    period_ns: of the link's polls, if they are known.
     """
     table = np.array(buckets, dtype=np.float64)
     pivot = float(table[-1, 6])
     while True:
-        line, clear = _blend_window(table, prior, pivot)
+        line, clear = _blend_window(table, prior, pivot, period_ns)
         span = float(table[-1, 6] - table[0, 0])
         if not clear or span < FIRST_WINDOW_S * S:
             return line
         table = table[table[:, 6] >= pivot - SHRINK * span]
 
 
-def _blend_window(table: Floats, prior: SlopePrior, pivot: float) -> tuple[Line, bool]:
+def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: float) -> tuple[Line, bool]:
     """The line of one window, and whether a third of the window stays clear of it."""
     low_x, low_y, mean_x, mean_y, sd_mean = (table[:, i] for i in range(5))
     span = max(float(low_x[-1] - low_x[0]), 1.0)
     flat = mean_y - low_y - prior.slope * (mean_x - low_x)
-    spread = max(float(np.median(flat)), 1.0)
+    spread = max(float(np.median(flat)), 0.5 * period_ns, 1.0)
     minutes = span / (60 * S)
     weight = [1 / prior.sigma**2]
     slopes = [prior.slope]
@@ -184,7 +190,10 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float) -> tuple[Line,
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
-            sd_hull = 2.5 / (1 + minutes) * spread / span * (1 + span / (2 * length))
+            height = low_y - slope_hull * low_x
+            unsteady = min(4 * float(np.median(height) - height.min()) / spread, 1.0)
+            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-4 * minutes))
+            sd_hull = 2.5 / (1 + minutes) * doubt * spread / span * (1 + span / (2 * length))
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
             slopes.append(slope_hull)
@@ -200,5 +209,19 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float) -> tuple[Line,
     thirds = np.array_split(above, 3)
     limit = max(0.5 * spread, 2 * float(np.median(above)))
     clear = above.size >= 9 and any(float(part.min()) > limit for part in thirds)
-    level = max(float(np.median(above)) / math.sqrt(above.size), 0.02 * spread)
+    sd_slope = min(sd_slope, _slope_room(low_x, above, lowest) + 0.5 * spread / span * math.exp(-minutes))
+    unsteady = min(4 * float(np.median(above)) / spread, 1.0)
+    gap = float(np.sort(above)[min(2, above.size - 1)])
+    level = max(gap, 0.005 * spread) + 0.2 * unsteady * spread / (1 + minutes)
     return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear
+
+
+def _slope_room(x: Floats, above: Floats, lowest: int) -> float:
+    """How far a line may turn about the lowest point without rising over another one."""
+    dx = np.abs(x - x[lowest])
+    steepest = [
+        float((above[side] / dx[side]).min())
+        for side in (dx > 0) & np.stack([x < x[lowest], x > x[lowest]])
+        if side.any()
+    ]
+    return max(steepest) if len(steepest) == 2 else math.inf

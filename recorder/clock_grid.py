@@ -39,9 +39,9 @@ RESIDUES = 30
 
 SHAPES = np.geomspace(0.5, 10.0, 73)  # of the gamma law
 UNITS = np.linspace(0.0, 7.0, 280) ** 2  # delays in units of the law's scale
-LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log ratio of the tail's mean
-LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(5.0)])
-LAW_SIGMA = np.array([0.5, 50.0, 1.5, 0.7])
+LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log of (ratio of the tail's mean - 2)
+LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(3.0)])
+LAW_SIGMA = np.array([0.5, 50.0, 0.8, 0.7])
 OUTLIERS = 2e-4
 SOFT_EDGE = 0.02  # of the period: how fast "earlier than possible" becomes impossible
 STEPS = 6
@@ -70,6 +70,7 @@ class GridPoints:
     count: Floats
     residues: Ints  # how many polls have each index modulo RESIDUES
     jitter_ns: float
+    spread_ns: float  # of the delays, 10 to 75 %
 
 
 # -- the delay law ----------------------------------------------------------------------------------------------------
@@ -88,7 +89,7 @@ class DelayLaw:
     def of(cls, law: Floats) -> DelayLaw:
         """From the four unbounded parameters."""
         shape = math.exp(min(max(law[0], math.log(0.8)), math.log(8.0)))
-        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), math.exp(law[3]))
+        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), 2 + math.exp(law[3]))
 
     @property
     def mean_ns(self) -> float:
@@ -113,8 +114,9 @@ class DelayLaw:
         tail_density = decay / mean * (delay > 0)
         density = (1 - w) * body_density + w * tail_density
         by_tail = -w * delay * tail_density
+        by_ratio = by_tail * (1 - 2 / self.ratio)
         by_weight = (1 - decay - body) * w * (1 - 2 * w)
-        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_tail], axis=1)
+        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_ratio], axis=1)
         return (1 - w) * body + w * (1 - decay), slopes
 
     def seen(self, distance: Floats, period: float) -> tuple[Floats, Floats]:
@@ -171,7 +173,7 @@ class IntervalFit:
         """Damped Fisher scoring from a start."""
         p = weights.size
         value, gradient, information = self.objective(weights, law)
-        damping = 1e-3
+        damping = 1e-5
         for _ in range(steps):
             matrix = information + damping * np.diag(np.diag(information))
             step = np.linalg.solve(matrix, gradient)
@@ -181,7 +183,7 @@ class IntervalFit:
             if trial[0] > value:
                 gain = trial[0] - value
                 weights, law, (value, gradient, information) = trial_weights, trial_law, trial
-                damping = max(damping / 5, 1e-6)
+                damping = max(damping / 10, 1e-10)
                 if gain < 1e-2:
                     break
             else:
@@ -238,11 +240,11 @@ class GridTracker:
     def rewound(self, arrival: Floats) -> GridTracker:
         """A tracker that knows the period and frequency already and begins at the first of these arrivals."""
         other = GridTracker()
-        other.period_ns, other._frequency = self.period_ns, self._frequency  # noqa: SLF001
+        other.period_ns, other._frequency = self.period_ns, self._frequency
         period = self.period_ns * (1 + self._frequency)
         phase = float(np.angle(np.exp(2j * np.pi * ((arrival % period) / period)).mean())) / (2 * np.pi) * period
-        other._edge = phase + math.floor((arrival[0] - phase) / period) * period  # noqa: SLF001
-        other._covariance = np.diag([(0.1 * period) ** 2, (1e-6) ** 2])  # noqa: SLF001
+        other._edge = phase + math.floor((arrival[0] - phase) / period) * period
+        other._covariance = np.diag([(0.1 * period) ** 2, (1e-6) ** 2])
         return other
 
     def feed(self, arrival: Floats) -> tuple[Floats, NDArray[np.bool_], Ints, float] | None:
@@ -265,7 +267,7 @@ class GridTracker:
         return polls, on_grid, index, jitter
 
     def _search(self, arrival: Floats) -> None:
-        fresh = np.unique(arrival[:MAX_PER_BUCKET])
+        fresh = np.unique(arrival[:: math.ceil(arrival.size / MAX_PER_BUCKET)])
         seen = np.concatenate([self._recent, fresh])
         new = (fresh.size + self._recent.size % CHUNK) // CHUNK
         periods = np.array(PERIODS_NS)
@@ -275,6 +277,7 @@ class GridTracker:
             if chunk.size < CHUNK:
                 continue
             phasor = np.exp(2j * np.pi * ((chunk[:, None] % periods) / periods)).mean(axis=0)
+            phasor[periods > 0.5 * (chunk[-1] - chunk[0])] = 0.0  # too short a look
             power = (CHUNK * np.abs(phasor) ** 2 - 1) / (CHUNK - 1)
             self._power = FORGET * self._power + (1 - FORGET) * power
             self._chunks += 1
@@ -346,6 +349,7 @@ class GridTracker:
 
 def snap(x: Floats, y: Floats, slope: float, tracker: GridTracker) -> GridPoints | None:
     """One bucket's samples on their polls, or nothing without a grid."""
+    spread = float(np.subtract(*np.quantile(y - slope * x, (0.75, 0.1))))
     order = np.argsort(x + y, kind="stable")
     x, arrival = x[order], (x + y)[order]
     followed = tracker.feed(arrival)
@@ -356,8 +360,8 @@ def snap(x: Floats, y: Floats, slope: float, tracker: GridTracker) -> GridPoints
     y = polls[on_grid] - x
     residues = np.bincount(index % RESIDUES, minlength=RESIDUES)
     if x.size <= 2 * CELLS_PER_PERIOD:
-        return GridPoints(x, y, np.ones_like(x), residues, jitter)
+        return GridPoints(x, y, np.ones_like(x), residues, jitter, spread)
     cell = np.floor((y - slope * (x - x[0])) * (CELLS_PER_PERIOD / tracker.period_ns)).astype(np.int64)
     _, cell, count = np.unique(cell, return_inverse=True, return_counts=True)
     mean_x, mean_y = np.bincount(cell, x) / count, np.bincount(cell, y) / count
-    return GridPoints(mean_x, mean_y, count.astype(np.float64), residues, jitter)
+    return GridPoints(mean_x, mean_y, count.astype(np.float64), residues, jitter, spread)

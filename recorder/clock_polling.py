@@ -9,13 +9,16 @@ weight stays with the line beneath.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from recorder.clock_fit import Floats, Line, SlopePrior
 from recorder.clock_grid import (
+    LAW_PRIOR,
     RESIDUES,
+    STEPS,
     DelayLaw,
     Fitted,
     GridPoints,
@@ -29,14 +32,20 @@ S = 1e9  # ns
 WINDOW_S = 120.0
 MIN_SPAN_S = 1.5
 YOUNG_S = 20.0
-CURVATURE = (1.0, 10.0, 40.0)  # one sigma of the curvature, ns/s^2: least, at first, most
+CURVATURE = (1.0, 10.0, 25.0)  # one sigma of the curvature, ns/s^2: least, at first, most
 FREE = 1e12
 STARTS = (0.05, 0.3, 0.6)  # of the period below the lowest point
-FIRST_LAW = np.array([math.log(1.5), 0.0, -3.0, math.log(5.0)])
 MIN_KEPT = 0.35
+HIGH_RANK, HIGH_SIGMA = 0.12, 4.0
+FIRST_STEPS = 12
+RIVAL = 4.0  # a maximum less than this below the best one may be the true one
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
+RECENT = 30  # buckets
+MAX_WAITING = 64
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
+COARSE_ERROR = 0.02
+STEADIEST, LOOSEST = 0.003, 0.015  # jitter of polls in periods; else it may be the device's own rhythm
 COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows unless the delays are longer still
 
 
@@ -71,36 +80,68 @@ class _Start:
 
 
 class PollingGrid:
-    """Points on the polls of one clock's link and the fit to them."""
+    """Points on the polls of one clock's link and the fit to them.
+
+    `feed` and `restart` only take note; all work is done in `fit`, which may run in another thread.
+    """
 
     def __init__(self, tracker: GridTracker | None = None):
         self.tracker = tracker or GridTracker()
         self.points: list[GridPoints] = []
+        self._waiting: deque[tuple[int, Floats, Floats, float]] = deque(maxlen=MAX_WAITING)
+        self._epoch = 0
+        self._points_epoch = 0
         self._last: _Start | None = None
         self._load = 0.0
+        self._rivalry = 0.0
+        self._real = False
         self._fits = 0
         self._bending = CURVATURE[1] ** 2  # variance of the curvature, learnt from its estimates
 
     def restart(self) -> None:
         """A new sync epoch: the polls go on, the points and the level do not."""
-        self.points = []
-        self._last = None
+        self._epoch += 1
+
+    @property
+    def period_ns(self) -> float:
+        """Of the polls; 0 without a grid, or when steady delays make the device's own rhythm look like one."""
+        return self.tracker.period_ns if self._real else 0.0
+
+    def unseen_ns(self, age_s: float) -> float:
+        """One sigma of the height above the floor that the polls may hide from a line under the arrivals.
+
+        Until a sample's phase has slid over the edge of a poll, anything within a period is possible; a slow period
+        is a latency timer on top of finer polls, whose beat against it is slow.
+        """
+        period = self.tracker.period_ns
+        jitter = float(np.median([p.jitter_ns for p in self.points[-RECENT:]])) if self.points else 0.0
+        if not STEADIEST * period < jitter < LOOSEST * period:
+            return 0.0
+        hidden = 0.0 if self._real else period / math.sqrt(12) * math.exp(-age_s / 60)
+        return math.hypot(hidden, COARSE_ERROR * period if period > COARSE_NS else 0.0)
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:
-        """Learn from a bucket's samples."""
-        period = self.tracker.period_ns
-        points = snap(x, y, slope, self.tracker)
-        if self.tracker.period_ns != period:
-            self.restart()
-        elif points is not None:
-            self.points.append(points)
-            while x[-1] - self.points[0].x[0] > 1.1 * WINDOW_S * S:
-                del self.points[0]
+        """Take note of a bucket's samples."""
+        self._waiting.append((self._epoch, x, y, slope))
+
+    def _take_in(self) -> None:
+        """Put the samples that wait on their polls."""
+        while self._waiting:
+            epoch, x, y, slope = self._waiting.popleft()
+            period = self.tracker.period_ns
+            points = snap(x, y, slope, self.tracker)
+            if epoch != self._points_epoch or self.tracker.period_ns != period:
+                self.points, self._last, self._points_epoch = [], None, epoch
+            if points is not None:
+                self.points.append(points)
+                while x[-1] - self.points[0].x[0] > 1.1 * WINDOW_S * S:
+                    del self.points[0]
 
     def fit(self, line: Line, prior: SlopePrior) -> GridLine | None:
         """The grid's curve near `line`, or nothing when there is no grid worth using."""
-        points, period = self.points[:], self.tracker.period_ns
-        if not points or not period:
+        self._take_in()
+        points, period = self.points, self.tracker.period_ns
+        if not points or not period or self._points_epoch != self._epoch:
             return None
         end = float(points[-1].x.max())
         points = [p for p in points if p.x[-1] > end - WINDOW_S * S]
@@ -111,6 +152,9 @@ class PollingGrid:
         bucket = np.repeat(np.arange(len(points)), [p.x.size for p in points])
         t = (x - end) / S
         height = y - line.offset - line.slope * x
+        self._real = spreads_over_polls(points, height, count)
+        if not self._real:
+            return None
         basis = np.stack([np.ones_like(t), t, t**2], axis=1)
         centre = np.array([0.0, (prior.slope - line.slope) * S, 0.0])
         precision = np.diag([FREE**-2, (prior.sigma * S) ** -2, 1 / self._bending])
@@ -120,7 +164,6 @@ class PollingGrid:
             return None
         fitted, kept = best
         covariance = np.asarray(np.linalg.inv(fitted.information), dtype=np.float64)
-        self._learn_bending(fitted.weights[2], covariance[2, 2])
         self._last = _Start(
             end,
             line.at(end) + fitted.weights[0],
@@ -128,8 +171,9 @@ class PollingGrid:
             fitted.weights[2] / S**2,
             fitted.law,
         )
-        jitter = float(np.median([p.jitter_ns for p in points]))
-        trust, sd = self._trust(problem, fitted, covariance, kept, t, jitter)
+        trust, sd = self._trust(problem, fitted, covariance, kept, t)
+        if trust > 0.5:
+            self._learn_bending(fitted.weights[2], covariance[2, 2])
         residues = np.sum([p.residues for p in points], axis=0)
         if on_coarser_grid(residues):
             trust = 0.0
@@ -161,10 +205,13 @@ class PollingGrid:
                 problem.count = without_late(problem, everything, weights, last.law, bucket)
         self._fits += 1
         if not starts or span_s < YOUNG_S or self._fits % 8 == 0:
-            mean = float(problem.count @ problem.height / problem.count.sum()) - low
-            law = FIRST_LAW + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
+            mean = float(problem.count @ problem.height / problem.count.sum()) - low - 0.5 * problem.period
+            law = LAW_PRIOR + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
             starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in STARTS]
-        best = max((problem.climb(*start) for start in starts), key=lambda fit: fit.value)
+        fits = [problem.climb(*start, FIRST_STEPS if len(starts) > 1 else STEPS) for start in starts]
+        best = max(fits, key=lambda fit: fit.value)
+        rivals = [fit.weights[0] - best.weights[0] for fit in fits if fit.value > best.value - RIVAL]
+        self._rivalry = max(0.5 * abs(apart) for apart in rivals) if len(fits) > 1 else 0.7 * self._rivalry
         if not math.isfinite(best.value):
             return None
         kept = without_late(problem, everything, best.weights, best.law, bucket)
@@ -182,12 +229,12 @@ class PollingGrid:
         self._bending += weight * (min(max(free**2 - noise, least**2), most**2) - self._bending)
 
     def _trust(
-        self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats, jitter: float
+        self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats
     ) -> tuple[float, tuple[float, float]]:
         """How far to believe the fit, and one sigma of its height and slope at the newest end."""
-        sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance))
+        sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance), self._rivalry)
         sd_slope = math.sqrt(max(covariance[1, 1], 0.0))
-        fitness = judge(problem, fitted, kept, t, jitter)
+        fitness = judge(problem, fitted, kept, t)
         self._load = max(0.85 * self._load, fitness.load)
         share = float(kept.sum()) / max(float(sum(p.count.sum() for p in self.points)), 1.0)
         trust = fitness.trust * ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
@@ -213,37 +260,51 @@ class Fitness:
     load: float
 
 
-def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats, jitter_ns: float) -> Fitness:
-    """Test a fit: do the delays spread over polls at all, do they follow the law, and the same one throughout?"""
+def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> Fitness:
+    """Test a fit: do the delays follow the law, and the same one throughout?"""
     distance = problem.height - problem.basis @ fitted.weights
     law = DelayLaw.of(fitted.law)
-    low, high = weighted_quantiles(distance, kept, (0.1, 0.9))
-    if high - low < WIDE * jitter_ns:
-        return Fitness(0.0, 0.0)
     upper, _ = law.cdf(distance)
     lower, _ = law.cdf(distance - problem.period)
     kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
     misfit = misfit_of(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
-    trust = ramp(misfit, 0.025, 0.045)
+    trust = ramp(misfit, 0.025, 0.045) * ramp(law.shape, 5.5, 7.5)  # at the bound it is another law
+    trust *= ramp(law.mean_ns / problem.period, 0.12, 0.04)  # as good as constant: the lowest points say it better
     if problem.period > COARSE_NS:
         trust *= ramp(law.mean_ns / problem.period, 0.25, 0.1)
     return Fitness(trust, load_dependence(lower, upper, kept, t))
 
 
-def without_late(problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints) -> Floats:
-    """Counts with the buckets zeroed whose delays are of another kind, unless these are the most."""
-    good = problem.bucket_test(law, weights, bucket, count)[bucket]
-    return np.where(good, count, 0.0) if count[good].sum() > MIN_KEPT * count.sum() else count
+def without_late(
+    problem: IntervalFit, count: Floats, weights: Floats, law: Floats, bucket: Ints, *, by_rank: bool = False
+) -> Floats:
+    """Counts with the buckets zeroed whose delays are of another kind, unless these are the most.
+
+    by_rank: also those that rank high in the law throughout, for a law that was fitted to them, too.
+    """
+    good = problem.bucket_test(law, weights, bucket, count)
+    if by_rank:
+        distance = problem.height - problem.basis @ weights
+        kind = DelayLaw.of(law)
+        rank = 0.5 * (kind.cdf(distance)[0] + kind.cdf(distance - problem.period)[0]) - 0.5
+        total = np.maximum(np.bincount(bucket, count), 1.0)
+        good &= np.bincount(bucket, count * rank) / total < np.maximum(HIGH_RANK, HIGH_SIGMA * 0.29 / np.sqrt(total))
+    kept = good[bucket]
+    return np.where(kept, count, 0.0) if count[kept].sum() > MIN_KEPT * count.sum() else count
 
 
 def ramp(value: float, good: float, bad: float) -> float:
+    """1 at good or better, 0 at bad or worse."""
     return min(max((bad - value) / (bad - good), 0.0), 1.0)
 
 
-def weighted_quantiles(values: Floats, weight: Floats, shares: tuple[float, ...]) -> list[float]:
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return [float(values[order][min(np.searchsorted(total, q * total[-1]), values.size - 1)]) for q in shares]
+def spreads_over_polls(points: list[GridPoints], height: Floats, count: Floats) -> bool:
+    """Whether the delays spread wider than what is taken for the jitter of the polls, within seconds or in all."""
+    spread, jitter = np.median([(p.spread_ns, p.jitter_ns) for p in points[-RECENT:]], axis=0)
+    order = np.argsort(height)
+    total = np.cumsum(count[order])
+    low, high = height[order][np.searchsorted(total, (0.25 * total[-1], 0.75 * total[-1]))]
+    return bool(max(spread, high - low) > WIDE * jitter)
 
 
 def misfit_of(lower: Floats, upper: Floats, count: Floats, phase: Floats) -> float:

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from recorder.clock_fit import Floats, hull_slope
 from recorder.clock_grid import LAW_PRIOR, Fitted, GridPoints, GridTracker, IntervalFit, snap
-from recorder.clock_polling import judge, on_coarser_grid, ramp, without_late
+from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, without_late
 
 Ints = NDArray[np.int64]
 
 S = 1e9  # ns
+PIECE_S = 1800.0  # longer epochs are refined in pieces, which bounds time and memory
+SEAM_S = 60.0  # over which one piece gives way to the next
 BIN_S = 0.25
 KNOT_S = (150.0, 75.0, 37.5)
 MIN_SPAN_S = 1.0  # the slope of a shorter epoch is taken as nominal
@@ -27,6 +29,7 @@ GRID_KNOT_S = 20.0
 GRID_CURVATURE = 0.02e-6 / S
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
 ROUNDS = 4
+FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
@@ -169,32 +172,52 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | No
     basis = hat_basis(at_x, knots_x)
     precision = bending(knots_x, GRID_CURVATURE) + FREE * np.eye(knots_x.size)
     height = at_y - beneath.at(at_x)
+    if not spreads_over_polls(points, height, count):
+        return None
     level = beneath.at(knots_x)
     problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
     low = float(height.min())
-    mean = max(float(count @ height / count.sum()) - low, 0.1 * period)
+    mean = max(float(count @ height / count.sum()) - low - 0.5 * period, 0.1 * period)
     law = LAW_PRIOR + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
-    fits = [problem.climb(np.full(knots_x.size, low - share * period), law, 12) for share in GRID_STARTS]
+    fits = [problem.climb(np.full(knots_x.size, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
     best = max(fits, key=lambda fit: fit.value)
+    best = problem.climb(best.weights, best.law, MANY_STEPS)
     for _ in range(ROUNDS):
-        kept = without_late(problem, count, best.weights, best.law, bucket)
+        kept = without_late(problem, count, best.weights, best.law, bucket, by_rank=True)
         if (kept == problem.count).all():
             break
         problem.count = kept
-        best = problem.climb(best.weights, best.law, 12)
+        best = problem.climb(best.weights, best.law, MANY_STEPS)
     return Curve(knots_x, level + best.weights), _trust(problem, best, at_x, points)
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
-    jitter_ns = float(np.median([p.jitter_ns for p in points]))
-    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S, jitter_ns)
+    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S)
     if on_coarser_grid(np.sum([p.residues for p in points], axis=0)):
         return 0.0
     return fitness.trust * ramp(fitness.load, 0.02, 0.04)
 
 
 def refine_epoch(x: Floats, y: Floats) -> Curve:
-    """The curve of one sync epoch from its samples in ascending order."""
+    """The curve of one sync epoch from its samples in ascending order; a long one piece by piece."""
+    pieces = min(int((x[-1] - x[0]) / (PIECE_S * S)), x.size // 1000) + 1
+    if pieces == 1:
+        return _refine_piece(x, y)
+    edges = np.linspace(x[0], x[-1], pieces + 1)
+    knots_x = np.arange(x[0], x[-1] + SEAM_S * S, 0.1 * SEAM_S * S)
+    heights, weights = np.zeros_like(knots_x), np.zeros_like(knots_x)
+    for left, right in pairwise(edges.tolist()):
+        part = slice(*np.searchsorted(x, (left - SEAM_S * S, right + SEAM_S * S)).tolist())
+        if part.stop - part.start < 2:
+            continue
+        inside = np.minimum(knots_x - left, right - knots_x) / (SEAM_S * S) + 1
+        weight = np.clip(0.5 * inside, 1e-9, 1.0)
+        heights += weight * _refine_piece(x[part], y[part]).at(knots_x)
+        weights += weight
+    return Curve(knots_x, heights / weights)
+
+
+def _refine_piece(x: Floats, y: Floats) -> Curve:
     beneath = envelope_by_data(x, y)
     found = grid_curve(x, y, beneath)
     if found is None or found[1] == 0.0:

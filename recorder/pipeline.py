@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from drivers.device import DeviceConfig
 from drivers.samples import (
     ClockPairs,
+    DeviceEvent,
     FixSample,
     FrameSample,
     ImuSample,
@@ -68,13 +69,9 @@ class Pipeline:
 
     def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
         """Feed one sample with its arrival on the host's monotonic clock."""
-        summary = self._devices[device].summary
-        if isinstance(sample, LostFrame):
-            summary.dropped += 1
-        elif not isinstance(sample, ClockPairs):
-            summary.received += 1
-        for stamped in self._timebase.take(device, arrival_ns, sample):
-            self._place(stamped)
+        if not isinstance(sample, ClockPairs):
+            self._devices[device].summary.received += 1
+        self._timebase.take(device, arrival_ns, sample)
 
     def _place(self, stamped: Stamped) -> None:
         device = self._devices[stamped.device]
@@ -96,20 +93,19 @@ class Pipeline:
         """
         assert device.camera is not None
         has_begun = device.last_picture_ns >= 0
-        if isinstance(sample, FrameSample):
-            usable = time_ns > device.last_picture_ns and (sample.is_keyframe or not device.wait_for_keyframe)
-            device.wait_for_keyframe = not usable
-            if usable:
-                device.last_picture_ns = time_ns
-                self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
-                return
-            if has_begun:
-                device.summary.dropped += 1
-            else:
-                device.summary.before_start += 1
-        else:
-            device.wait_for_keyframe = True
-        if has_begun and time_ns > device.last_picture_ns:
+        is_later = time_ns > device.last_picture_ns
+        if isinstance(sample, FrameSample) and is_later and (sample.is_keyframe or not device.wait_for_keyframe):
+            device.wait_for_keyframe = False
+            device.last_picture_ns = time_ns
+            self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
+            return
+        device.wait_for_keyframe = True
+        if not has_begun:
+            device.summary.before_start += 1
+            return
+        device.summary.received -= 1
+        device.summary.dropped += 1
+        if is_later:
             self._synchronizer.add_picture(device.camera, device_ns, time_ns, None)
 
     def advance(self, now_ns: int) -> None:
@@ -188,3 +184,11 @@ def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int) -> ClockSumm
         resets=clock.resets,
         wraps=clock.wraps,
     )
+
+
+def count_event(summary: StreamSummary, event: DeviceEvent) -> None:
+    """Add what an event says was lost or dropped to the counts of its stream."""
+    if event.kind == "gap":
+        summary.lost += event.count
+    elif event.kind == "drop":
+        summary.dropped += event.count

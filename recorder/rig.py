@@ -20,6 +20,7 @@ from drivers.device import DeviceConfig, DeviceError, DriverType, driver_names, 
 from recorder.errors import ConfigError
 
 ROOT_KEYS = ("name", "devices", "calibration", "raw", "simulate")
+URL_LOGIN = re.compile(r"://[^/@\s]+@")
 DEVICE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 
 
@@ -39,7 +40,7 @@ class RigDevice:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A validated rig. source: the plain mapping it was made of, as it goes into recording.json."""
+    """A validated rig. source: the plain mapping it was made of, without passwords, as it goes into recording.json."""
 
     name: str
     devices: tuple[RigDevice, ...]
@@ -77,7 +78,7 @@ def parse_rig(text: str, origin: str, folder: Path, settings: tuple[str, ...] = 
         devices=made,
         calibration=(folder / calibration) if calibration else None,
         raw=raw,
-        source=source,
+        source=_without_passwords(source),
     )
 
 
@@ -96,6 +97,15 @@ def apply_settings(source: Mapping[str, Any], settings: tuple[str, ...]) -> dict
                 raise ConfigError(f"--set {setting}: {'.'.join(keys[: depth + 1])} is a value, not a mapping")
         node[keys[-1]] = _parse_value(value, setting)
     return changed
+
+
+def _without_passwords(value: Any) -> Any:
+    """The same value with the user and password in URLs blotted out: recordings are passed on."""
+    if isinstance(value, dict):
+        return {key: _without_passwords(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_without_passwords(entry) for entry in value]
+    return URL_LOGIN.sub("://***@", value) if isinstance(value, str) else value
 
 
 def _parse_yaml(text: str, origin: str) -> dict[str, Any]:

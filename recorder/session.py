@@ -19,9 +19,9 @@ from pathlib import Path
 
 from calibration.model import Calibration, CalibrationError, dump, load_calibration, validate
 from drivers.device import DeviceError, Driver, received
-from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, Sample, ScanSample
+from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, ScanSample
 from recorder.errors import ConfigError, RecorderError, StorageError
-from recorder.pipeline import DeviceInTake, Pipeline
+from recorder.pipeline import DeviceInTake, Pipeline, count_event
 from recorder.recording.folder import check_output, create_take_folder, free_bytes, low_water_bytes
 from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, StreamSummary
 from recorder.recording.work import ByteQueue
@@ -141,8 +141,13 @@ def _connect(rig: Rig, drivers: dict[str, Driver], stop: threading.Event, on_eve
             return str(error)
         return None
 
-    with ThreadPoolExecutor(max_workers=len(rig.devices)) as pool:
-        faults = dict(zip((device.name for device in rig.devices), pool.map(attempt, rig.devices), strict=True))
+    try:
+        with ThreadPoolExecutor(max_workers=len(rig.devices)) as pool:
+            faults = dict(zip((device.name for device in rig.devices), pool.map(attempt, rig.devices), strict=True))
+    except BaseException:
+        for driver in drivers.values():
+            driver.close()
+        raise
     missing = [device for device in rig.devices if faults[device.name] is not None]
     required = [f"device {device.name}: {faults[device.name]}" for device in missing if device.config.required]
     if required or stop.is_set():
@@ -177,6 +182,7 @@ class Take:
         self._on_event = on_event
         self._stop_reading = threading.Event()
         self._failure: str | None = None
+        self._is_merged = False
         self._inbox: ByteQueue[tuple[str, Received]] = ByteQueue(INBOX_BYTES)
         self._start_ns = time.monotonic_ns()
         cameras = _cameras(rig, drivers)
@@ -229,14 +235,18 @@ class Take:
         merger = threading.Thread(target=self._guard, args=("merge", self._merge), name="merge", daemon=True)
         for thread in (*readers, merger):
             thread.start()
-        stopped_by = self._watch(duration_s, stop, on_status)
-        end_ns = time.monotonic_ns()
-        self._stop_reading.set()
-        for thread in readers:
-            thread.join()
-        self._inbox.close()
-        merger.join()
-        return self._finish(end_ns, stopped_by)
+        stopped_by = "error"
+        try:
+            stopped_by = self._watch(duration_s, stop, on_status)
+        finally:
+            end_ns = time.monotonic_ns()
+            self._stop_reading.set()
+            for thread in readers:
+                thread.join()
+            self._inbox.close()
+            merger.join()
+            manifest = self._finish(end_ns, stopped_by)
+        return manifest
 
     def _guard(self, name: str, body: Callable[..., None], *arguments: str) -> None:
         try:
@@ -254,7 +264,7 @@ class Take:
 
     def _read_device(self, name: str) -> None:
         """Hand over all that a device sends until the take stops."""
-        drop_began = False
+        burst = 0  # samples without room since there was room
         for item in received(self._drivers[name], self._stop_reading, connected=name in self._connected):
             self._writer.raw.put_chunks(name, item.chunks)
             for event in item.events:
@@ -262,23 +272,27 @@ class Take:
             if not item.samples:
                 continue
             if self._inbox.offer((name, item), _size(item)):
-                drop_began = False
+                self._note_burst(name, burst)
+                burst = 0
                 continue
-            kept, lost = _without_payload(item)
-            self._devices[name].summary.dropped += lost
-            if not drop_began:
-                self._note(name, DeviceEvent("drop", "the recorder is too slow: samples are dropped", lost))
-            drop_began = True
-            self._inbox.offer((name, kept), 0)
+            if not burst:
+                self._note(name, DeviceEvent("warning", "the recorder is too slow: samples are dropped"))
+            burst += len(item.samples)
+            placeholders = _placeholders(item)
+            self._devices[name].summary.dropped += len(item.samples) - len(placeholders.samples)
+            self._inbox.force((name, placeholders))
+        self._note_burst(name, burst)
+
+    def _note_burst(self, name: str, count: int) -> None:
+        if count:
+            text = f"{count} samples found no room in the recorder"
+            self._writer.events.write(name, "drop", text, count)
+            self._on_event(name, DeviceEvent("drop", text, count))
 
     def _note(self, name: str, event: DeviceEvent) -> None:
         """Write an event down, count what it says was lost, and tell the user."""
-        summary = self._devices[name].summary
-        if event.kind == "gap":
-            summary.lost += event.count
-        elif event.kind == "drop":
-            summary.dropped += event.count
-        elif event.kind == "connected":
+        count_event(self._devices[name].summary, event)
+        if event.kind == "connected":
             self._connected.add(name)
             self._manifest.devices[name].identity = self._drivers[name].identity
         elif event.kind == "lost":
@@ -295,6 +309,7 @@ class Take:
             self._pipeline.advance(time.monotonic_ns())
             time.sleep(MERGE_EVERY_S)  # collects samples: the order of streams needs no haste
         self._pipeline.finish()
+        self._is_merged = True
 
     # -- the calling thread --
 
@@ -334,14 +349,16 @@ class Take:
                 )
             )  # fmt: skip
         elapsed_s = (time.monotonic_ns() - self._start_ns) / NS_PER_S
-        left_s = max(0.0, free - low_water_bytes(self._bytes_per_s)) / self._bytes_per_s
+        left_s = max(0.0, free - low_water_bytes(self._bytes_per_s)) / max(self._bytes_per_s, 1.0)
         return TakeStatus(self._folder, elapsed_s, devices, free, left_s)
 
     def _finish(self, end_ns: int, stopped_by: str) -> Manifest:
         for device, dropped in self._writer.raw.dropped_bytes.items():
             self._writer.events.write(device, "drop", f"the raw tape lost {dropped} bytes for want of room", dropped)
         self._manifest.clocks = self._pipeline.clock_summaries()
-        faults = self._writer.close(end_ns - self._start_ns, stopped_by)
+        if self._failure is not None:
+            stopped_by = f"error: {self._failure}"
+        faults = self._writer.close(end_ns - self._start_ns, stopped_by, complete=self._is_merged)
         if faults:
             raise StorageError(f"{self._folder}: could not be finished: {'; '.join(faults)}")
         return self._manifest
@@ -377,10 +394,11 @@ def _size(item: Received) -> int:
     return size
 
 
-def _without_payload(item: Received) -> tuple[Received, int]:
-    """What is left of samples that find no room: a lost picture keeps its time. Gives how many others were lost."""
-    kept: list[tuple[int, Sample]] = []
-    for arrival_ns, sample in item.samples:
-        if isinstance(sample, FrameSample):
-            kept.append((arrival_ns, LostFrame(sample.device_ticks)))
-    return Received(samples=tuple(kept)), len(item.samples) - len(kept)
+def _placeholders(item: Received) -> Received:
+    """What is left of samples that find no room: a lost picture keeps its time (and is counted when it is placed)."""
+    kept = [
+        (arrival_ns, LostFrame(sample.device_ticks))
+        for arrival_ns, sample in item.samples
+        if isinstance(sample, FrameSample)
+    ]
+    return Received(samples=tuple(kept))

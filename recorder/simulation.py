@@ -10,6 +10,7 @@ from recorder.errors import ConfigError, RecorderError
 
 END_OF_YAML = "..."
 STOP_TIMEOUT_S = 5.0
+EXIT_WRONG_USE = 2
 
 
 def command(rig: Path | None, settings: tuple[str, ...]) -> list[str]:
@@ -38,7 +39,7 @@ class SimulatedRig:
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         assert self._process.stdout is not None
-        lines = []
+        lines: list[str] = []
         for line in self._process.stdout:
             if line.rstrip() == END_OF_YAML:
                 self.yaml = "".join(lines)
@@ -47,7 +48,8 @@ class SimulatedRig:
         exit_code = self._process.wait()
         self._messages.seek(0)
         message = self._messages.read().strip() or "the simulated rig ended without a word"
-        if exit_code == 2:
+        self.close()
+        if exit_code == EXIT_WRONG_USE:
             raise ConfigError(message)
         raise RecorderError(f"the simulated rig failed: {message}")
 

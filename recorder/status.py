@@ -2,9 +2,11 @@
 
 import time
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
+from rich.progress import Progress
 from rich.table import Table
+from rich.text import Text
 
 from drivers.samples import DeviceEvent
 from recorder.recording.manifest import Manifest
@@ -42,12 +44,50 @@ class StatusDisplay:
 
     def event(self, device: str, event: DeviceEvent) -> None:
         """Tell of an event that a user should see at once."""
-        if event.kind not in QUIET_EVENTS:
-            self._console.print(f"{device}: {event.kind}: {event.text}", markup=False, highlight=False, soft_wrap=True)
+        _print_event(self._console, device, event)
 
 
-def _table(status: TakeStatus) -> Table:
-    table = Table(title=f"recording {status.folder} · {status.elapsed_s:.0f} s · {_disk(status)}", title_justify="left")
+class DecodeProgress:
+    """Shows how far a capture has been read; a context manager."""
+
+    def __init__(self, console: Console) -> None:
+        """console: where to write; a bar if it is a terminal, else a line now and then."""
+        self._console = console
+        self._bar = Progress(console=console, transient=True) if console.is_terminal else None
+        self._task = self._bar.add_task("decoding", total=None) if self._bar is not None else None
+        self._last_line_s = time.monotonic()
+
+    def __enter__(self) -> "DecodeProgress":
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def show(self, position_bytes: int, size_bytes: int) -> None:
+        """Show how much has been read."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=position_bytes, total=size_bytes)
+        elif time.monotonic() - self._last_line_s >= PLAIN_EVERY_S:
+            self._last_line_s = time.monotonic()
+            share = 100 * position_bytes / max(size_bytes, 1)
+            self._console.print(f"{position_bytes / 1e6:.0f} of {size_bytes / 1e6:.0f} MB read ({share:.0f} %)")
+
+    def event(self, device: str, event: DeviceEvent) -> None:
+        """Tell of an event that a user should see at once."""
+        _print_event(self._console, device, event)
+
+
+def _print_event(console: Console, device: str, event: DeviceEvent) -> None:
+    if event.kind not in QUIET_EVENTS:
+        console.print(f"{device}: {event.kind}: {event.text}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _table(status: TakeStatus) -> Group:
+    title = Text(f"recording {status.folder} · {status.elapsed_s:.0f} s · {_disk(status)}", style="bold")
+    table = Table(box=None, pad_edge=False)
     table.add_column("device")
     table.add_column("kind")
     for column in ("rate Hz", "count", "lost", "dropped", "age ms"):
@@ -64,7 +104,7 @@ def _table(status: TakeStatus) -> Table:
             "-" if device.lag_s is None else f"{device.lag_s * 1e3:.0f}",
             style=style,
         )
-    return table
+    return Group(title, table)
 
 
 def _plain(status: TakeStatus) -> str:
@@ -84,7 +124,7 @@ def _disk(status: TakeStatus) -> str:
 
 def print_summary(console: Console, manifest: Manifest) -> None:
     """What a finished take holds."""
-    table = Table()
+    table = Table(box=None, pad_edge=False)
     for column in ("device", "kind"):
         table.add_column(column)
     for column in ("received", "written", "lost", "dropped", "late", "before start", "incomplete"):

@@ -12,6 +12,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 P = TypeVar("P")
 REMEMBERED_SETS = 256
+ORDER_STEP_NS = 1000
 
 
 @dataclass(slots=True)
@@ -68,8 +69,26 @@ class Synchronizer(Generic[T, P]):
             if abs(given_device_ns - device_ns) < self.pair_within_ns:
                 time_ns = given_time_ns  # its partner went out without it: same instant, same time
                 break
+        else:
+            time_ns = self._between_neighbours(device_ns, time_ns)
         self._open_sets.append((time_ns, frame_set))
         self._push(time_ns, frame_set)
+
+    def _between_neighbours(self, device_ns: int, time_ns: int) -> int:
+        """Keep sets in the order of their device times, which mapped times of two cameras may contradict.
+
+        While a clock is not known well yet, one camera's late pictures are mapped later than the other's next ones;
+        an encoded picture written before its forerunner could not be decoded.
+        """
+        sets = [(frame_set.device_ns, set_time_ns) for set_time_ns, frame_set in self._open_sets]
+        sets += self._given_out
+        before_ns = max((other_ns for other, other_ns in sets if other <= device_ns), default=None)
+        after_ns = min((other_ns for other, other_ns in sets if other > device_ns), default=None)
+        if before_ns is not None and time_ns <= before_ns:
+            time_ns = before_ns + ORDER_STEP_NS
+        if after_ns is not None and time_ns >= after_ns:
+            time_ns = after_ns - ORDER_STEP_NS if before_ns is None else (before_ns + after_ns) // 2
+        return time_ns
 
     def _push(self, time_ns: int, item: "T | FrameSet[P]") -> None:
         heapq.heappush(self._heap, (time_ns, self._sequence, item))

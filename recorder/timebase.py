@@ -1,9 +1,10 @@
 """Brings every device clock onto the host's monotonic clock: samples with device ticks in, samples with time out.
 
-One clock map per device clock; devices that share a clock feed one map through streams of their own. The first
-samples of a sync epoch are held back until the map knows the epoch, so that the first stamps are good too. A device's
-known latency is taken off its arrivals, which is the same as taking it off the mapped times and lets devices with
-different latencies share a clock.
+One clock map per device clock; devices that share a clock feed one map through streams of their own. Samples are fed as
+they come and stamped a moment later, all that came together with what all of them tell. The first samples of a sync
+epoch wait longer, until the map knows the epoch, so that the first stamps are good too. A device's known latency is
+taken off its arrivals, which is the same as taking it off the mapped times and lets devices with different latencies
+share a clock.
 """
 
 from dataclasses import dataclass, field
@@ -49,8 +50,8 @@ class _Clock:
     name: str
     map: ClockMap
     hold_until_ns: int
-    epoch: int
-    held: list[tuple[_DeviceStream, int, int, Sample]] = field(default_factory=list)
+    epoch: int = -1  # none yet
+    waiting: list[tuple[_DeviceStream, int, int, Sample]] = field(default_factory=list)
 
 
 class Timebase:
@@ -61,13 +62,14 @@ class Timebase:
         self._start_ns = start_ns
         self._clocks: dict[str, _Clock] = {}
         self._streams: dict[str, _DeviceStream] = {}
+        self._unclocked: list[Stamped] = []  # of devices that send no time
         self._epochs_begun: list[tuple[str, int]] = []
 
     def add_device(self, device: str, clock: str, tick_hz: float, wrap_bits: int, latency_ns: int) -> None:
         """Announce a device and the clock that stamps it."""
         if clock not in self._clocks:
             clock_map = ClockMap(tick_hz, wrap_bits)
-            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS, clock_map.epoch)
+            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS)
         shared = self._clocks[clock]
         self._streams[device] = _DeviceStream(
             device, shared, shared.map.stream(tick_hz, wrap_bits), tick_hz, latency_ns
@@ -82,61 +84,52 @@ class Timebase:
         begun, self._epochs_begun = self._epochs_begun, []
         return begun
 
-    def take(self, device: str, arrival_ns: int, sample: Sample) -> list[Stamped]:
-        """Feed one sample. Gives it back stamped, or nothing while it is held (see `release`) or has no time."""
+    def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
+        """Feed one sample; `release` gives it back stamped."""
         entry = self._streams[device]
         clock = entry.clock
         arrival_ns -= entry.latency_ns
         if isinstance(sample, ClockPairs):
             entry.batches.append(np.column_stack((sample.ticks, sample.arrival_ns)))
             entry.stream.observe_many(sample.ticks, sample.arrival_ns - entry.latency_ns)
-            self._watch_epoch(clock, arrival_ns)
-            return []
-        if isinstance(sample, ScanSample):
-            device_ns = entry.stream.unwrap(sample.last_ticks)
+        elif isinstance(sample, ScanSample):
+            clock.waiting.append((entry, entry.stream.unwrap(sample.last_ticks), arrival_ns, sample))
         elif sample.device_ticks is None:
-            return [Stamped(device, arrival_ns, arrival_ns, sample)]
+            self._unclocked.append(Stamped(device, arrival_ns, arrival_ns, sample))
         else:
             entry.pairs.append((sample.device_ticks, arrival_ns + entry.latency_ns))
             device_ns = entry.stream.observe(sample.device_ticks, arrival_ns)
-            self._watch_epoch(clock, arrival_ns)
-        if arrival_ns < clock.hold_until_ns:
-            clock.held.append((entry, device_ns, arrival_ns, sample))
-            return []
-        stamped = self._release_clock(clock)
-        stamped.append(self._stamp(entry, device_ns, arrival_ns, sample))
-        return stamped
+            clock.waiting.append((entry, device_ns, arrival_ns, sample))
+        self._watch_epoch(clock, arrival_ns)
 
     def _watch_epoch(self, clock: _Clock, arrival_ns: int) -> None:
         if clock.map.epoch != clock.epoch:
+            if clock.epoch >= 0:
+                self._epochs_begun.append((clock.name, clock.map.epoch))
             clock.epoch = clock.map.epoch
             clock.hold_until_ns = max(clock.hold_until_ns, arrival_ns + HOLD_NS)
-            self._epochs_begun.append((clock.name, clock.epoch))
 
     def release(self, now_ns: int) -> list[Stamped]:
-        """Held samples whose time has come."""
-        stamped: list[Stamped] = []
+        """All samples fed so far but those of an epoch that is too young; those of one device in order."""
+        stamped, self._unclocked = self._unclocked, []
         for clock in self._clocks.values():
-            if clock.held and now_ns >= clock.hold_until_ns:
-                stamped.extend(self._release_clock(clock))
+            if now_ns >= clock.hold_until_ns:
+                waiting, clock.waiting = clock.waiting, []
+                stamped.extend(self._stamp(*sample) for sample in waiting)
         return stamped
 
     def flush(self) -> list[Stamped]:
-        """All held samples: the end of a take."""
-        return [stamped for clock in self._clocks.values() for stamped in self._release_clock(clock)]
-
-    def _release_clock(self, clock: _Clock) -> list[Stamped]:
-        held, clock.held = clock.held, []
-        return [self._stamp(*entry) for entry in held]
+        """All samples that are left: the end of a take."""
+        return self.release(max((clock.hold_until_ns for clock in self._clocks.values()), default=0))
 
     def _stamp(self, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
         host_ns = min(entry.clock.map.host_ns(device_ns), arrival_ns)
         point_host_ns = None
         if isinstance(sample, ScanSample) and len(sample.points):
             ticks = np.rint(sample.points["timestamp"] * entry.tick_hz).astype(np.int64)
-            point_host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
+            point_host_ns = np.minimum(entry.clock.map.host_ns(entry.stream.unwrap(ticks)), arrival_ns)
             host_ns = int(point_host_ns.max())
-        host_ns = max(host_ns, min(entry.last_host_ns, arrival_ns))
+        host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
         entry.last_host_ns = host_ns
         return Stamped(entry.device, host_ns, device_ns, sample, point_host_ns)
 

@@ -19,7 +19,7 @@ from drivers.samples import POINT_DTYPE, FixSample, FrameSample, ImuSample, Pose
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.recording.manifest import DeviceSummary, StreamSummary
 from recorder.recording.writer import RecordingWriter, new_manifest
-from simulated_devices.camera import PictureEncoder
+from simulated_devices.camera import ClientStream, PictureEncoder
 from simulated_devices.nmea import ORIGIN, SIGMA_M
 from simulated_devices.pose import quaternion
 from simulated_devices.rig import Cast, calibration, simulate_settings
@@ -113,13 +113,13 @@ class Twin:
         camera: PinholeCamera = self._cast.cameras[self.cameras.index(name)]
         fps = self._rate_hz(name, "fps", 20)
         renderer = CameraRenderer(self._cast.room, camera, seed=self._cast.stage.seed_for("camera", name))
-        encoder = PictureEncoder(camera.width, camera.height, fps)
+        encoder = PictureEncoder(ClientStream(), camera.width, camera.height, fps)
         video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p", b"")
         for times_ns in self._times(fps, FRAMES_AFTER_IMU_NS):
             rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             for index, time_ns in enumerate(times_ns.tolist()):
                 picture = renderer.render(rotation[index], position_m[index])
-                packet = encoder.packet(picture, time_ns // 1000)
+                packet = encoder.encode(picture, time_ns // 1000)
                 exposure_s = self.entries[name].get("exposure_s")
                 sample = FrameSample(time_ns, bytes(packet), bool(packet.is_keyframe), video, exposure_s)
                 yield time_ns, order, name, sample

@@ -16,6 +16,7 @@ from typing import Annotated
 
 import av
 import msgspec
+from av.bitstream import BitStreamFilterContext
 from av.container import InputContainer
 from av.packet import Packet
 from av.video.stream import VideoStream
@@ -25,8 +26,15 @@ from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.links import SILENCE_S, GarbageWatch
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, Sample, VideoFormat
 
-INTER_CODED = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "mpeg4", "ffv1"})
-INTRA_CODED = frozenset({"mjpeg", "rawvideo", "png"})
+INTER_CODED = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "mpeg4"})
+INTRA_CODED = frozenset({"mjpeg"})
+ANNEX_B_FILTERS = {"h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb"}
+# How a key frame shows that it carries its headers: the sequence parameter set, or MPEG-4's video object layer.
+HEADERS = {
+    "h264": re.compile(rb"\x00\x00\x01[\x07\x27\x47\x67]"),
+    "hevc": re.compile(rb"\x00\x00\x01[\x42\x43]"),
+    "mpeg4": re.compile(rb"\x00\x00\x01[\x20-\x2f]"),
+}
 OPEN_TIMEOUT_S = 5.0
 # FFmpeg looks at the first picture only, and hands it on: `fflags nobuffer` would keep what was looked at, which is
 # the first key frame, and all pictures up to the second one would be worthless.
@@ -119,14 +127,17 @@ class StreamDriver:
     def _size_is_known(self) -> bool:
         assert self._container is not None
         video = self._container.streams.video
-        return bool(video) and video[0].codec_context.width > 0
+        return bool(video) and getattr(video[0].codec_context, "width", 0) > 0
 
     def _check_video(self) -> VideoFormat:
         stream = self._video_stream()
+        if getattr(stream, "codec_context", None) is None:  # PyAV's mark of a codec without decoder
+            raise DeviceError(f"{self._shown_url}: the video is of a codec that FFmpeg here does not know")
         context = stream.codec_context
-        if context.name not in INTER_CODED | INTRA_CODED:
+        codec = context.codec.canonical_name
+        if codec not in INTER_CODED | INTRA_CODED:
             allowed = ", ".join(sorted(INTER_CODED | INTRA_CODED))
-            raise DeviceError(f"{self._shown_url}: video is {context.name}; it can be recorded as {allowed}")
+            raise DeviceError(f"{self._shown_url}: video is {codec}; it can be recorded as {allowed}")
         if not self._size_is_known():
             raise DeviceError(f"{self._shown_url}: no key frame came that tells the size of the pictures")
         for side, want, got in (
@@ -137,14 +148,8 @@ class StreamDriver:
                 raise DeviceError(f"{self._shown_url}: {side} is {got}, configured {want}")
         if context.has_b_frames:
             raise self._b_frames()
-        return VideoFormat(
-            context.name,
-            context.width,
-            context.height,
-            self._config.fps,
-            context.pix_fmt or "",
-            bytes(context.extradata or b""),
-        )
+        self._headers = _HeadersInBand(codec, stream)
+        return VideoFormat(codec, context.width, context.height, self._config.fps, context.pix_fmt or "", b"")
 
     def _b_frames(self) -> DeviceError:
         return DeviceError(
@@ -177,7 +182,7 @@ class StreamDriver:
             if not has_time:
                 yield self._picture(packet, arrival_ns, arrival_ns, lost=0)
             elif packet.pts is None:
-                self._leave_out(packet)
+                self._leave_out(packet.size)
                 yield Received(events=self._garbage.events(arrival_ns))
             else:
                 yield self._stamped(packet, int(packet.pts * time_base * NS_PER_S), arrival_ns)
@@ -191,9 +196,9 @@ class StreamDriver:
             reason = _reason(error, f"no picture for {self._silence_s:g} s")
             raise DeviceError(f"{self._shown_url}: {reason}") from error
 
-    def _leave_out(self, packet: "Packet[VideoStream]") -> None:
+    def _leave_out(self, size: int) -> None:
         self.bad_frames += 1
-        self.skipped_bytes += packet.size
+        self.skipped_bytes += size
         self._wait_for_keyframe = True
 
     def _stamped(self, packet: "Packet[VideoStream]", device_ticks: int, arrival_ns: int) -> Received:
@@ -212,13 +217,15 @@ class StreamDriver:
             self._wait_for_keyframe = False
         elif lost:
             self._wait_for_keyframe = True
-        if packet.is_corrupt:
-            self._leave_out(packet)
+        is_keyframe, size = packet.is_keyframe, packet.size
+        data = self._headers.whole(packet)
+        if data is None:
+            self._leave_out(size)
         sample: Sample
-        if self._wait_for_keyframe:
+        if data is None or self._wait_for_keyframe:
             sample = LostFrame(device_ticks)
         else:
-            sample = FrameSample(device_ticks, bytes(packet), packet.is_keyframe, self._format, self._config.exposure_s)
+            sample = FrameSample(device_ticks, data, is_keyframe, self._format, self._config.exposure_s)
         return Received(samples=((arrival_ns, sample),), events=events)
 
     def close(self) -> None:
@@ -226,6 +233,33 @@ class StreamDriver:
         if self._container is not None:
             self._container.close()
             self._container = None
+
+
+class _HeadersInBand:
+    """Makes every key frame carry the codec's headers, so that the packets alone make a video; H.264 as Annex B."""
+
+    def __init__(self, codec: str, stream: VideoStream) -> None:
+        """stream: where the headers stand apart from the packets, if they do."""
+        self._pattern = HEADERS.get(codec)
+        self._headers = bytes(stream.codec_context.extradata or b"") if self._pattern else b""
+        self._filter: BitStreamFilterContext | None = None
+        if codec in ANNEX_B_FILTERS and self._headers.startswith(b"\1"):  # as in MP4 and Matroska
+            self._filter = BitStreamFilterContext(ANNEX_B_FILTERS[codec], stream)
+            self._headers = b""
+
+    def whole(self, packet: "Packet[VideoStream]") -> bytes | None:
+        """The bytes of the packet with headers, None when it is damaged. The packet may be used up."""
+        if packet.is_corrupt:
+            return None
+        if self._filter is not None:
+            try:
+                return b"".join(map(bytes, self._filter.filter(packet)))
+            except av.error.FFmpegError:
+                return None
+        data = bytes(packet)
+        if self._pattern is not None and packet.is_keyframe and not self._pattern.search(data):
+            return self._headers + data
+        return data
 
 
 @dataclass(slots=True)

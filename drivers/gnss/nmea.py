@@ -1,6 +1,5 @@
 """Any GNSS receiver that sends NMEA 0183 on a serial port. It is listened to, never configured."""
 
-import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, NmeaDecoder
-from drivers.links import SILENCE_S, GarbageWatch, SerialLink
+from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, SerialPort
 from drivers.samples import Chunk, DeviceEvent, FixSample, Received, Sample
 
 READ_S = 0.1
@@ -38,8 +37,9 @@ class NmeaDriver:
 
     def __init__(self, name: str, config: NmeaConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
-        self._link: SerialLink | None = None
+        self._link: SerialPort | None = None
         self.streams = (StreamSpec("gnss", config.rate_hz, config.rate_hz * FIX_BYTES),)
 
     @property
@@ -50,7 +50,7 @@ class NmeaDriver:
     def connect(self) -> None:
         """Open the port. Raises DeviceError when that fails."""
         self.close()
-        self._link = SerialLink(self._config.port, self._config.baud)
+        self._link = self.links.serial(self._config.port, self._config.baud)
 
     def read(self, stop: Event) -> Iterator[Received]:
         """Yield what comes. Raises DeviceError when the receiver is gone or silent."""
@@ -59,7 +59,7 @@ class NmeaDriver:
         period_s = 1 / self._config.rate_hz
         idle_s = max(MIN_IDLE_S, IDLE_SHARE * period_s)
         self._link.discard_input()  # the arrival of what waits is not known
-        decoder = NmeaDecoder(time.time_ns())
+        decoder = NmeaDecoder(self.links.utc_ns())
         arrivals = _Arrivals()
         where = f"{self._config.port} at {self._config.baud} baud"
         care = _Care(decoder, where, max(SILENCE_S, SILENT_PERIODS * period_s))

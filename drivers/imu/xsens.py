@@ -24,7 +24,7 @@ from drivers.imu.mtdata2 import (
     Mtdata2Decoder,
     XbusFramer,
 )
-from drivers.links import SILENCE_S, GarbageWatch, SerialLink
+from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, SerialPort
 from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample
 
 ANSWER_S = 0.5
@@ -97,10 +97,11 @@ class XsensDriver:
 
     def __init__(self, name: str, config: XsensConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
         self._rate_hz = config.rate_hz
         self._identity: dict[str, str] = {}
-        self._link: SerialLink | None = None
+        self._link: SerialPort | None = None
         self._decoder = Mtdata2Decoder()
         self._begun = Received()
 
@@ -124,7 +125,7 @@ class XsensDriver:
         self.close()
         self._decoder = Mtdata2Decoder(self._config.magnetic_field_ut)
         self._begun = Received()
-        self._link = SerialLink(self._config.port, self._config.baud)
+        self._link = self.links.serial(self._config.port, self._config.baud)
         if self._config.configure:
             try:
                 self._configure(self._link)
@@ -132,7 +133,7 @@ class XsensDriver:
                 self.close()
                 raise
 
-    def _configure(self, link: SerialLink) -> None:
+    def _configure(self, link: SerialPort) -> None:
         """All but GoToMeasurement: the device stays quiet until it is read, so that nothing waits in the port."""
         dialogue = _Dialogue(link, self._decoder.framer, f"{self._config.port} at {self._config.baud} baud")
         outputs = output_configuration(self._config.rate_hz)
@@ -144,7 +145,7 @@ class XsensDriver:
         self._identity = {"serial": device_id.hex().upper(), "firmware": ".".join(map(str, firmware[:3]))}
         self._begun = Received(tuple(dialogue.chunks), events=warnings)
 
-    def _begin(self, link: SerialLink) -> Received:
+    def _begin(self, link: SerialPort) -> Received:
         """Let the device measure, or where it does so already throw away what waits: its arrival is not known."""
         if not self._config.configure:
             link.discard_input()
@@ -188,7 +189,7 @@ class _Dialogue:
     chunks: all bytes both ways. left_over: frames that came behind the last answer, with their arrival.
     """
 
-    link: SerialLink
+    link: SerialPort
     framer: XbusFramer
     where: str
     chunks: list[Chunk] = field(default_factory=list)

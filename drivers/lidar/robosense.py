@@ -4,7 +4,6 @@ Datagrams wait in the socket's buffer for a few milliseconds and are then taken 
 of them, while each keeps the kernel's time of its arrival.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from threading import Event
 from typing import Annotated
@@ -19,7 +18,7 @@ from drivers.lidar.models import HELIOS, M1, MODELS, Model, ModelKey, SequencedM
 from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
 from drivers.lidar.slots import DUAL_RETURN
 from drivers.lidar.watches import BadPacketWatch, LossWatch, SetupWatch
-from drivers.links import SILENCE_S, UdpLink
+from drivers.links import LIVE, SILENCE_S, Links, UdpOptions, UdpPorts
 from drivers.samples import POINT_DTYPE, Chunk, ClockPairs, DeviceEvent, Received, Sample, ScanSample
 
 FIRST_PACKET_S = 3.0
@@ -84,10 +83,11 @@ class RobosenseDriver:
 
     def __init__(self, name: str, config: RobosenseConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
         self._named = MODELS[config.model] if config.model is not None else None
         self.streams = (StreamSpec("lidar", config.rate_hz, _bytes_per_s(self._named or M1)),)
-        self._link: UdpLink | None = None
+        self._link: UdpPorts | None = None
         self._options = PointOptions(
             min_range_m=config.min_range_m,
             max_range_m=config.max_range_m,
@@ -129,18 +129,13 @@ class RobosenseDriver:
         if difop is not None:
             decoder.feed(difop)
 
-    def _open(self) -> UdpLink:
+    def _open(self) -> UdpPorts:
         config = self._config
-        return UdpLink(
-            config.address,
-            (config.msop_port, config.difop_port),
-            source_port=config.source_port,
-            multicast_group=config.multicast_group,
-            interface=config.interface,
-            shared=True,
-        )
+        ports = (config.msop_port, config.difop_port)
+        options = UdpOptions(config.source_port, config.multicast_group, config.interface, shared=True)
+        return self.links.udp(config.address, ports, options)
 
-    def _meet(self, link: UdpLink) -> tuple[Model, bytes | None, list[DeviceEvent]]:
+    def _meet(self, link: UdpPorts) -> tuple[Model, bytes | None, list[DeviceEvent]]:
         """Wait for the lidar; gives its model, an information packet, and what a user should know."""
         config = self._config
         first = self._wait_for(link, lambda data: recognise(data) is not None, FIRST_PACKET_S)
@@ -181,21 +176,21 @@ class RobosenseDriver:
         config = self._config
         return chunk.data[config.user_layer_bytes : max(0, len(chunk.data) - config.tail_layer_bytes)]
 
-    def _wait_for(self, link: UdpLink, wanted: Callable[[bytes], bool], timeout_s: float) -> Chunk | None:
+    def _wait_for(self, link: UdpPorts, wanted: Callable[[bytes], bool], timeout_s: float) -> Chunk | None:
         """Hold what comes until something wanted is among it; None after `timeout_s`."""
-        deadline_s = time.monotonic() + timeout_s
+        deadline_ns = self.links.monotonic_ns() + int(timeout_s * 1e9)
         looked_at = 0
         while True:
             for chunk in self._held[looked_at:]:
                 if wanted(self._packet(chunk)):
                     return chunk
             looked_at = len(self._held)
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or looked_at >= HELD_DATAGRAMS:
+            left_ns = deadline_ns - self.links.monotonic_ns()
+            if left_ns <= 0 or looked_at >= HELD_DATAGRAMS:
                 return None
-            self._held += link.read(left_s)
+            self._held += link.read(left_ns / 1e9)
 
-    def _no_packet(self, link: UdpLink) -> str:
+    def _no_packet(self, link: UdpPorts) -> str:
         config = self._config
         advice = "the lidar's destination address must be this host's, and no firewall may stand between"
         packets = [self._packet(chunk) for chunk in self._held]
@@ -217,10 +212,10 @@ class RobosenseDriver:
         assert link is not None
         yield Received(events=tuple(self._connect_events))
         yield from self._backlog(link)
-        last_packet_ns, last_arrival_ns = time.monotonic_ns(), self._last_arrival_ns
+        last_packet_ns, last_arrival_ns = self.links.monotonic_ns(), self._last_arrival_ns
         while not stop.is_set():
             chunks = link.read(0.1)
-            now_ns = time.monotonic_ns()
+            now_ns = self.links.monotonic_ns()
             received = self._take(chunks, now_ns)
             if received.chunks or received.events:
                 yield received
@@ -229,25 +224,25 @@ class RobosenseDriver:
             elif now_ns - last_packet_ns > SILENCE_S * 1e9:
                 break
             if 0 < len(chunks) < BATCH_DATAGRAMS:
-                time.sleep(self._collect_s)
+                self.links.sleep(self._collect_s)
         last_scans = [(self._last_arrival_ns, scan) for scan in self._decoder.finish()]
         yield Received(
             samples=(*self._pairs(), *last_scans),
-            events=self._losses.events(time.monotonic_ns()),
+            events=self._losses.events(self.links.monotonic_ns()),
         )
         if not stop.is_set():
             raise DeviceError(f"{self._config.address}: no measurement packet for {SILENCE_S:.0f} s")
 
-    def _backlog(self, link: UdpLink) -> Iterator[Received]:
+    def _backlog(self, link: UdpPorts) -> Iterator[Received]:
         """What came between connecting and now; nothing if the socket's buffer overflowed while nobody read it."""
         chunks, self._held = self._held, []
         while len(chunks) < HELD_DATAGRAMS and (more := link.read(0.0)):
             chunks += more
-        self._last_arrival_ns = time.monotonic_ns()
+        self._last_arrival_ns = self.links.monotonic_ns()
         if self._losses.forgive_kernel_drops():
             return
         for first in range(0, len(chunks), BATCH_DATAGRAMS):
-            yield self._take(chunks[first : first + BATCH_DATAGRAMS], time.monotonic_ns())
+            yield self._take(chunks[first : first + BATCH_DATAGRAMS], self.links.monotonic_ns())
 
     def _take(self, chunks: list[Chunk], now_ns: int) -> Received:
         """Decode a batch: first its clock pairs, so that its frames can be placed in time."""

@@ -8,7 +8,6 @@
 listened to by both devices.
 """
 
-import time
 from collections.abc import Iterator
 from threading import Event
 from typing import Annotated, Literal
@@ -18,7 +17,7 @@ from msgspec import Meta
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.lidar.imu import ImuDecoder
 from drivers.lidar.robosense import Ipv4Address, Ipv4OrNone
-from drivers.links import SILENCE_S, GarbageWatch, UdpLink
+from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, UdpOptions, UdpPorts
 from drivers.samples import Chunk, DeviceEvent, Received, Sample
 
 FIRST_PACKET_S = 3.0
@@ -50,11 +49,12 @@ class RobosenseImuDriver:
 
     def __init__(self, name: str, config: RobosenseImuConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
         self._port = config.port or PORTS[config.model]
         rate_hz = config.rate_hz or RATES_HZ[config.model]
         self.streams = (StreamSpec("imu", rate_hz, rate_hz * BYTES_PER_SAMPLE),)
-        self._link: UdpLink | None = None
+        self._link: UdpPorts | None = None
 
     @property
     def identity(self) -> dict[str, str]:
@@ -65,38 +65,33 @@ class RobosenseImuDriver:
         """Open the port and wait for the first reading. Raises DeviceError with what to check."""
         config = self._config
         self.close()
-        self._link = link = UdpLink(
-            config.address,
-            (self._port,),
-            multicast_group=config.multicast_group,
-            interface=config.interface,
-            shared=True,
-        )
+        options = UdpOptions(multicast_group=config.multicast_group, interface=config.interface, shared=True)
+        self._link = link = self.links.udp(config.address, (self._port,), options)
         self._decoder = ImuDecoder(config.model)
         self._garbage = GarbageWatch(self._decoder)
         self._lost = 0
         self._held: list[Chunk] = []
-        deadline_s = time.monotonic() + FIRST_PACKET_S
+        deadline_ns = self.links.monotonic_ns() + int(FIRST_PACKET_S * 1e9)
         probe = ImuDecoder(config.model)
         while not any(probe.feed(chunk.data) for chunk in self._held):
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
+            left_ns = deadline_ns - self.links.monotonic_ns()
+            if left_ns <= 0:
                 count = probe.bad_frames
                 self.close()
                 raise DeviceError(
                     f"no IMU reading from {config.address} on UDP port {self._port} within {FIRST_PACKET_S:.0f} s; "
                     f"{count} datagrams of other kinds came; {link.foreign} came from other addresses"
                 )
-            self._held = link.read(left_s)
+            self._held = link.read(left_ns / 1e9)
 
     def read(self, stop: Event) -> Iterator[Received]:
         """Yield readings. Raises DeviceError after silence."""
         link = self._link
         assert link is not None
-        last_sample_ns = time.monotonic_ns()
+        last_sample_ns = self.links.monotonic_ns()
         chunks = self._held
         while not stop.is_set():
-            now_ns = time.monotonic_ns()
+            now_ns = self.links.monotonic_ns()
             received = self._take(chunks, now_ns)
             if received.chunks or received.events:
                 yield received

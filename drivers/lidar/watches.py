@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from drivers.lidar.robosense_decoder import RobosenseDecoder
-from drivers.links import GarbageWatch, UdpLink
+from drivers.links import GarbageWatch, UdpPorts
 from drivers.samples import DeviceEvent
 
 BURST_QUIET_NS = 10_000_000_000
@@ -38,7 +38,7 @@ class LossWatch:
     reported as drops, and only what is missing beyond them as a gap, so that the sum of both is what was lost.
     """
 
-    def __init__(self, decoder: RobosenseDecoder, link: UdpLink) -> None:
+    def __init__(self, decoder: RobosenseDecoder, link: UdpPorts) -> None:
         self._decoder = decoder
         self._link = link
         self._lost = self._restarts = self._kernel_drops = self._foreign = 0

@@ -5,6 +5,7 @@ videos, devices, files. Each look adds findings. Recordings of other programs, w
 """
 
 import hashlib
+from collections import Counter
 from pathlib import Path
 
 import msgspec
@@ -19,7 +20,7 @@ from recorder.recording.reader import DATA_NAME, MAX_LINE_BYTES, StreamStats, Vi
 
 CALIBRATION_NAME = "calibration.json"
 RATE_TOLERANCE = 0.05
-EDGE_S = 5.0  # how much later than the others a stream may begin, or earlier end
+EDGE_S = 3.0  # how much later than the others a stream may begin, or earlier than the take end
 ACCEL_MEAN_MIN_M_S2, ACCEL_MEAN_MAX_M_S2 = 8.0, 12.0
 GYRO_MAX_RAD_S = 20.0
 COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
@@ -125,12 +126,14 @@ def _check_streams(data: DataCheck, manifest: Manifest | None, findings: Finding
             findings.add("error" if has_imu else "warning", "no-imu", name, "missing: clients give no poses without")
     begin_s = min((stats.first_s for stats in streams.values()), default=0.0)
     end_s = max((stats.last_s for stats in streams.values()), default=0.0)
+    if manifest and manifest.duration_s is not None:
+        end_s = max(end_s, manifest.duration_s)
     for name, stats in streams.items():
         _check_stream(name, stats, findings)
         if stats.first_s > begin_s + EDGE_S:
             findings.add("warning", "starts-late", name, f"begins {stats.first_s - begin_s:.1f} s after the first")
         if stats.last_s < end_s - EDGE_S:
-            findings.add("warning", "ends-early", name, f"ends {end_s - stats.last_s:.1f} s before the last")
+            findings.add("warning", "ends-early", name, f"ends {end_s - stats.last_s:.1f} s before the take")
     if (accel := streams.get("accelerometer")) and accel.norm_sum:
         mean_m_s2 = accel.norm_sum / accel.count
         if not ACCEL_MEAN_MIN_M_S2 <= mean_m_s2 <= ACCEL_MEAN_MAX_M_S2:
@@ -252,16 +255,27 @@ def _check_counts(manifest: Manifest, data: DataCheck, findings: Findings) -> No
 
 
 def _check_events(folder: Path, findings: Findings) -> None:
-    decoder = msgspec.json.Decoder(dict[str, msgspec.Raw])
+    decoder = msgspec.json.Decoder(_Event)
+    lost: Counter[str] = Counter()
     try:
         with (folder / EVENTS_NAME).open("rb") as file:
             for number, raw in enumerate(iter(lambda: file.readline(MAX_LINE_BYTES), b""), 1):
                 try:
-                    decoder.decode(raw)
+                    event = decoder.decode(raw)
                 except (ValueError, RecursionError) as error:
                     findings.add("warning", "events", EVENTS_NAME, f"line {number}: {error}")
+                    continue
+                lost[event.device] += event.kind == "lost"
     except OSError as error:
         findings.add("warning", "events", EVENTS_NAME, f"cannot be read: {error.strerror}")
+    for device, times in (+lost).items():
+        text = f"the device was lost {times} time{'s'[: times > 1]} in the take; see {EVENTS_NAME}"
+        findings.add("warning", "device-lost", device, text)
+
+
+class _Event(msgspec.Struct):
+    device: str
+    kind: str
 
 
 def _check_files(folder: Path, manifest: Manifest, deep: bool, findings: Findings) -> None:
@@ -280,16 +294,9 @@ def _check_files(folder: Path, manifest: Manifest, deep: bool, findings: Finding
 
 def print_report(report: Report, console: Console) -> None:
     """The report for people: streams, videos, findings, verdict."""
-    table = Table(
-        Column("stream", no_wrap=True),
-        "count",
-        "rate Hz",
-        "expected",
-        "from s",
-        "to s",
-        "gaps",
-        title=escape(report.folder),
-    )
+    console.print(report.folder, markup=False, soft_wrap=True)
+    numbers = (Column(name, justify="right") for name in ("count", "rate Hz", "expected", "from s", "to s", "gaps"))
+    table = Table(Column("stream", no_wrap=True), *numbers, box=None, pad_edge=False)
     for stream in report.streams:
         rates = ("" if rate is None else f"{rate:.2f}" for rate in (stream.rate_hz, stream.expected_hz))
         span = (f"{stream.first_s:.3f}", f"{stream.last_s:.3f}")

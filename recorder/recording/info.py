@@ -171,7 +171,8 @@ def print_info(recording: Info, console: Console) -> None:
     size = f"{recording.total_bytes / 1e6:.1f} MB"
     headline = f"{recording.name}: {recording.duration_s:.2f} s{start}, {state}{stopped}, {size}"
     console.print(headline, markup=False, soft_wrap=True)
-    table = Table(Column("stream", no_wrap=True), "kind", "count", "Hz", "from s", "to s", "lost", "dropped", "late")
+    numbers = (Column(name, justify="right") for name in ("count", "Hz", "from s", "to s", "lost", "dropped", "late"))
+    table = Table(Column("stream", no_wrap=True), "kind", *numbers, box=None, pad_edge=False)
     for stream in recording.streams:
         rate = "" if stream.rate_hz is None else f"{stream.rate_hz:.2f}"
         losses = ("" if count is None else str(count) for count in (stream.lost, stream.dropped, stream.late))

@@ -18,10 +18,11 @@ NS_PER_S = 1_000_000_000
 class StreamSummary(msgspec.Struct, omit_defaults=False):
     """Counts of one stream of one device.
 
-    received: samples decoded; written: in the recording; lost: missed by the link, by the device's own numbering;
-    dropped: received and not recorded for want of room or because a picture before was lost; late: written out of
-    order first and merged at the end; before_start: sampled before the take's time 0; incomplete: samples that
-    lack what the format needs (a fix without altitude); rate_hz: expected, null where unknown.
+    received, dropped and lost add up to what the device sent. received: samples taken in; written: of these, in the
+    recording; dropped: came but could not be recorded, for want of room or because a picture before was lost; lost:
+    never came, by the device's own numbering (of a lidar packets, else samples). late: written out of order first and
+    merged at the end; before_start: sampled before time 0, or pictures before the first key frame; incomplete: lacked
+    what the format needs (a fix without altitude). rate_hz: expected, null where unknown.
     """
 
     kind: str

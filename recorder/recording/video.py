@@ -23,7 +23,7 @@ from drivers.samples import FrameSample, VideoFormat
 from recorder.recording.work import ByteQueue, Ticket, start_thread
 
 QUEUE_BYTES = 64 << 20
-CRASH_SAFE = {"cluster_time_limit": "1", "flush_packets": "1"}
+CRASH_SAFE = {"cluster_time_limit": "1", "flush_packets": "1", "fflags": "+bitexact"}
 MILLISECONDS = Fraction(1, 1000)
 SYNC_PICTURES = 30
 IDLE_S = 0.5

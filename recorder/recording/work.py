@@ -59,6 +59,11 @@ class ByteQueue(Generic[T]):
             self._append(item, size)
             return True
 
+    def force(self, item: T) -> None:
+        """Take an item so small that it is not counted."""
+        with self._changed:
+            self._append(item, 0)
+
     def put(self, item: T, size: int) -> None:
         """Take the item, waiting for room; after `close` nothing waits any more."""
         with self._changed:

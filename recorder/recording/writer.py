@@ -66,8 +66,9 @@ class RecordingWriter:
         lidar: bool,
         raw: bool,
         on_error: OnError,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Create all files in an existing, empty folder."""
+        """Create all files in an existing, empty folder. monotonic_ns: the clock that stamps events."""
         self._faults: list[str] = []
 
         def failed(name: str, error: Exception) -> None:
@@ -80,7 +81,7 @@ class RecordingWriter:
         write_manifest(folder, manifest)
         if calibration is not None:
             write_atomically(folder / CALIBRATION_NAME, calibration)
-        self.events = EventLog(folder / EVENTS_NAME, start_ns)
+        self.events = EventLog(folder / EVENTS_NAME, start_ns, monotonic_ns)
         self.raw = RawWriter(folder, manifest.utc_at_time_0.utc_ns - start_ns, failed, tape=raw)
         self._lines = LineWriter(folder, failed)
         self._scans = ScanWriter(folder, failed) if lidar else None
@@ -139,10 +140,11 @@ class RecordingWriter:
             pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None))
         self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
 
-    def close(self, duration_ns: int, stopped_by: str) -> list[str]:
+    def close(self, duration_ns: int, stopped_by: str, *, complete: bool = True) -> list[str]:
         """Finish all files; recording.json says complete last of all, unless a file could not be written or finished.
 
-        Gives what went wrong, a line each; the other files are closed all the same.
+        complete: False when not all that came was handed over. Gives what went wrong, a line each; the other files are
+        closed all the same.
         """
         faults = self._faults
         for camera, video in zip(self.manifest.cameras, self.videos, strict=True):
@@ -165,7 +167,7 @@ class RecordingWriter:
         self.manifest.files = dict(sorted(files.items()))
         self.manifest.duration_s = duration_ns / NS_PER_S
         self.manifest.stopped_by = stopped_by
-        if not faults:
+        if complete and not faults:
             self.manifest.state = "complete"
         try:
             write_manifest(self.folder, self.manifest)

@@ -230,14 +230,23 @@ def read_all(link: UdpLink) -> list[Chunk]:
 
 
 def test_kernel_stamps_on_the_monotonic_clock(udp: UdpLink) -> None:
+    """The stamp tells when a datagram came, not when it was read.
+
+    The kernel begins to stamp a moment after the first socket asks for it; until then it stamps when it is read.
+    """
     margin_ns = 1_000_000  # the two clocks are read one after the other
-    before_ns = time.monotonic_ns()
-    send(udp, b"A")
-    sent_ns = time.monotonic_ns()
-    while time.monotonic_ns() < sent_ns + 5 * margin_ns:
-        pass
-    (chunk,) = udp.read(PATIENCE_S)
-    assert before_ns - margin_ns < chunk.arrival_ns < sent_ns + margin_ns  # when it came, not when it was read
+    for _ in range(200):
+        before_ns = time.monotonic_ns()
+        send(udp, b"A")
+        sent_ns = time.monotonic_ns()
+        while time.monotonic_ns() < sent_ns + 5 * margin_ns:
+            pass
+        (chunk,) = udp.read(PATIENCE_S)
+        assert before_ns - margin_ns < chunk.arrival_ns <= time.monotonic_ns()
+        if chunk.arrival_ns < sent_ns + margin_ns:
+            break
+    else:
+        pytest.fail("no datagram was stamped when it came")
     assert chunk.source is not None
     assert chunk.source[0] == LOCALHOST
     assert chunk.destination == (LOCALHOST, ports_of(udp)[0])

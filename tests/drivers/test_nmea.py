@@ -15,8 +15,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from drivers import links
 from drivers.device import DeviceError
-from drivers.gnss import nmea
 from drivers.gnss.nmea import DRIVER, NmeaConfig, NmeaDriver
 from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, NmeaDecoder
 from drivers.samples import Chunk, FixSample, Received
@@ -325,12 +325,21 @@ def make_driver(port: str, rate_hz: float = 10) -> NmeaDriver:
     return driver
 
 
-def test_fixes_over_a_pty_then_hang_up() -> None:
+def test_fixes_over_a_pty_then_hang_up(monkeypatch: pytest.MonkeyPatch) -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     driver = make_driver(os.ttyname(slave))
     driver.connect()
-    os.write(master, rmc() + gga() + gst())
+    os.write(master, rmc("115959.00") + gga("115959.00"))  # waited for its reader for an unknown time
+    link = driver._link
+    assert link is not None
+    discard = link.discard_input
+
+    def discard_then_send() -> None:
+        discard()
+        os.write(master, rmc() + gga() + gst())
+
+    monkeypatch.setattr(link, "discard_input", discard_then_send)
     stop = Event()
     data, fixes = b"", []
     for received in driver.read(stop):
@@ -340,6 +349,7 @@ def test_fixes_over_a_pty_then_hang_up() -> None:
             stop.set()
     assert data == rmc() + gga() + gst()
     assert [fix.accuracy_source for _, fix in fixes] == ["gst"]
+    monkeypatch.setattr(link, "discard_input", lambda: None)
     reading = driver.read(Event())
     os.close(slave)
     os.close(master)
@@ -364,11 +374,14 @@ class ScriptedLink:
         arrival_ms, data = next(self.reads)
         return arrival_ms * 1_000_000, data
 
+    def discard_input(self) -> None:
+        pass
+
 
 def scripted(
     monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], rate_hz: float = 10
 ) -> Iterator[Received]:
-    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", rate_hz)
     driver.connect()
     assert [(stream.kind, stream.rate_hz) for stream in driver.streams] == [("gnss", rate_hz)]
@@ -408,7 +421,7 @@ def test_silence_is_a_device_error(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_warnings_and_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     noise = [(i * 500, b"\xfe\x80") for i in range(12)]
-    monkeypatch.setattr(nmea.time, "time_ns", lambda: utc_ns(NOON))
+    monkeypatch.setattr(links.time, "time_ns", lambda: utc_ns(NOON))
     old = gga() + rmc(date="080407")
     reads = [*noise, (6000, old), (6040, b""), (6100, b"\x80" * 5), (7200, b"")]
     reading = scripted(monkeypatch, reads)

@@ -6,7 +6,6 @@ import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -92,11 +91,11 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     net = Network()
 
     class SendsWhenBound(UdpLink):
-        def __init__(self, address: str, ports: tuple[int, ...], **keys: Any) -> None:
-            super().__init__(address, ports, **keys)
+        def __init__(self, address: str, ports: tuple[int, ...], options: links.UdpOptions | None = None) -> None:
+            super().__init__(address, ports, options)
             net.at_connect()
 
-    monkeypatch.setattr(robosense, "UdpLink", SendsWhenBound)
+    monkeypatch.setattr(links, "UdpLink", SendsWhenBound)
     monkeypatch.setattr(robosense, "FIRST_PACKET_S", 0.1)
     monkeypatch.setattr(robosense, "DIFOP_PERIOD_S", 0.1)
     return net

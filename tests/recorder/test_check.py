@@ -369,6 +369,18 @@ def test_a_stream_that_stops_early(good: Recording) -> None:
     assert sorted(found) == ["frames", "gps", "groundTruth", "lidar"]
 
 
+def test_a_take_that_outlived_its_devices(good: Recording) -> None:
+    assert good.manifest is not None
+    good.manifest["duration_s"] = DURATION_S + 10
+    good.files["events.jsonl"] = b'{"time":2.1,"device":"gnss","kind":"lost","text":"hang-up"}\n' * 2
+    good.write()
+    findings = check(good.folder).findings
+    early = {finding.subject for finding in findings if finding.code == "ends-early"}
+    assert early == {"accelerometer", "gyroscope", "gps", "groundTruth", "lidar", "frames"}
+    (lost,) = [finding for finding in findings if finding.code == "device-lost"]
+    assert (lost.subject, lost.text) == ("gnss", "the device was lost 2 times in the take; see events.jsonl")
+
+
 def test_a_file_of_nothing_but_faults_gives_few_findings(good: Recording) -> None:
     good.write()
     (good.folder / "data.jsonl").write_bytes(b"{}}\n" * 50_000)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorder.clock import ClockMap, refine
+from recorder.clock import ClockMap, refine, stored_sigma_ppm
 
 BOOT_NS = 250_000 * 10**9
 MS = 1_000_000
@@ -114,6 +114,59 @@ def test_refine_is_better_than_online_and_needs_no_start() -> None:
     stamps_ns = refine(t.ticks, t.arrival_ns, 1e6)
     assert_causal(stamps_ns, t)
     assert rms_us(stamps_ns, t, after_s=0.0) < 0.5 * rms_us(t.mapped(ClockMap(1e6)), t)
+
+
+def test_polling_grid_gives_slope_and_level() -> None:
+    t = trace(poll_ms=1.0, jitter_ms=0.7, duration_s=60.0, skew_ppm=-60.0)
+    with_grid = rms_us(t.mapped(ClockMap(1e6)), t, after_s=20.0)
+    model = rms_us(t.mapped(ClockMap(1e6, level="model")), t, after_s=20.0)
+    without = rms_us(t.mapped(ClockMap(1e6, use_grid=False)), t, after_s=20.0)
+    assert model < 40
+    assert with_grid < 60
+    assert with_grid < 1.1 * without
+    assert rms_us(refine(t.ticks, t.arrival_ns, 1e6), t, after_s=0.0) < 20
+
+
+def test_a_devices_own_rhythm_is_no_polling_grid() -> None:
+    t = trace(rate_hz=100.0, jitter_ms=0.2, duration_s=40.0)
+    assert (t.mapped(ClockMap(1e6)) == t.mapped(ClockMap(1e6, use_grid=False))).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "kind", [{"rate_hz": 400.0}, {"rate_hz": 20.0, "jitter_ms": 1.0}, {"poll_ms": 1.0, "jitter_ms": 0.7}]
+)
+def test_uncertainty_is_true_and_not_too_wide(kind: dict[str, float]) -> None:
+    t = trace(duration_s=90.0, skew_ppm=70.0, **kind)
+    clock = ClockMap(1e6)
+    off_ns, sigma_ns = [], []
+    for true, tick, arrival in zip(t.true_ns.tolist(), t.ticks.tolist(), t.arrival_ns.tolist(), strict=True):
+        off_ns.append(abs(clock.map(tick, arrival) - true))
+        sigma_ns.append(clock.uncertainty_ns)
+    off, sigma = np.array(off_ns)[t.true_ns > BOOT_NS + 2e10], np.array(sigma_ns)[t.true_ns > BOOT_NS + 2e10]
+    assert np.mean(off <= 2 * sigma) > 0.95
+    assert 2 * sigma.mean() < 8 * np.quantile(off, 0.95)
+
+
+def test_two_way_pairs_tell_the_floor() -> None:
+    t = trace(duration_s=20.0)
+    floor_ns = 3 * MS
+    clock = ClockMap(1e6)
+    assert clock.floor_ns is None
+    for i, (true, tick, arrival) in enumerate(
+        zip(t.true_ns.tolist(), t.ticks.tolist(), t.arrival_ns.tolist(), strict=True)
+    ):
+        clock.map(tick, arrival + floor_ns)
+        if i % 200 == 199:
+            clock.observe_two_way(tick, true - 200_000, true + 100_000)
+    assert clock.floor_ns is not None
+    assert clock.floor_bound_ns == 150_000
+    assert abs(clock.floor_ns - floor_ns) < 200_000
+
+
+def test_stored_skew_loses_worth_with_age() -> None:
+    ages = [stored_sigma_ppm(0.1, age_s) for age_s in (0.0, 60.0, 3600.0, 1e7, 1e12)]
+    assert ages == sorted(ages)
+    assert (ages[0], ages[-1]) == (2.0, 100.0)
 
 
 # -- wraps, duplicates, stalls, restarts ------------------------------------------------------------------------------

@@ -193,3 +193,10 @@ def test_keys_that_yaml_reads_as_something_else_are_named():
     """`on`, `yes`, `no` are truth values to YAML; the rig could not be written into recording.json."""
     assert fault(GOOD, "simulate={on: 1}") == "rig.yaml: simulate.True: a key must be text; quote it"
     assert fault(GOOD, "simulate.list=[1, {2020-01-01: 1}]").startswith("rig.yaml: simulate.list.1.2020-01-01: a key")
+
+
+def test_logins_in_urls_do_not_go_into_the_recording():
+    text = 'devices: {cam: {driver: port, port: "rtsp://user:secret@10.0.0.2/live"}}'
+    rig = parse(text)
+    assert rig.source["devices"]["cam"]["port"] == "rtsp://***@10.0.0.2/live"
+    assert rig.devices[0].config.port == "rtsp://user:secret@10.0.0.2/live"
