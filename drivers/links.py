@@ -148,6 +148,9 @@ class UdpLink:
             self._batches: BatchReceiver | None = BatchReceiver()
         except OSError:
             self._batches = None
+        member = b""
+        if options.multicast_group:
+            member = _packed_ipv4(options.multicast_group) + _packed_ipv4(options.interface or "0.0.0.0")
         bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not options.multicast_group else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
@@ -155,7 +158,7 @@ class UdpLink:
             self._sockets[udp.fileno()] = udp
             self._readable.register(udp, select.POLLIN)
             if options.multicast_group:
-                self._join(udp, options.multicast_group, options.interface)
+                self._join(udp, member, options)
         self.receive_buffer_bytes = min(
             bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for bound in self._sockets.values()
         )
@@ -171,15 +174,14 @@ class UdpLink:
             self._shared[entry.udp.fileno()] = entry
         return entry.udp
 
-    def _join(self, udp: socket.socket, group: str, interface: str) -> None:
-        member = _packed_ipv4(group) + (_packed_ipv4(interface) if interface else bytes(4))
+    def _join(self, udp: socket.socket, member: bytes, options: UdpOptions) -> None:
         try:
             udp.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:  # another link of this port has joined already
                 self.close()
-                where = f" on {interface}" if interface else ""
-                raise DeviceError(f"multicast group {group}{where}: cannot join: {_reason(error)}") from error
+                where = f" on {options.interface}" if options.interface else ""
+                raise DeviceError(f"multicast group {options.multicast_group}{where}: {_reason(error)}") from error
 
     def accepts(self, source: tuple[str, int]) -> bool:
         """Whether a datagram from there is of this link's device."""
@@ -345,7 +347,7 @@ class _SharedPort:
 
 
 _shared_ports: dict[tuple[str, int], _SharedPort] = {}
-_shared_ports_lock = threading.Lock()
+_shared_ports_lock = threading.RLock()
 
 
 @lru_cache(maxsize=4096)
