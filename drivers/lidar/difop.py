@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivers.lidar.models import Model, SpinningModel
+from drivers.lidar.models import HELIOS32, Model, SpinningModel
 from drivers.lidar.spinning_points import TURN, Angles, Setup
 
 MAGIC = bytes.fromhex("A5FF005A11115555")
@@ -199,6 +199,8 @@ def _rs16_angles(difop: bytes) -> tuple[Angles, Angles] | None:
 
 def helios_lasers(difop: bytes) -> int:
     """Lasers of a Helios by its calibration: 32 when all of 32 have an angle, else 16; 0 when it has none."""
+    if len(difop) != HELIOS32.difop_bytes:
+        return 0
     entries = [difop[at : at + 3] for at in range(468, 468 + 96, 3)]
     ready = [entry for entry in entries if entry[0] in (0, 1) and int.from_bytes(entry[1:]) <= 9000]
     upper = ready[16:]

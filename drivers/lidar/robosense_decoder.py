@@ -81,6 +81,7 @@ class RobosenseDecoder(Counters):
         self._slot_bytes = self._crc_at = 0
         self._turns: TurnFrames | None = None
         self._setup: Setup | None = None
+        self._offered: Setup | None = None
         self._waiting: deque[bytes] = deque()
         self._crc_is_used = False
         self._last_packet = b""
@@ -240,10 +241,14 @@ class RobosenseDecoder(Counters):
         ticks = packet_ticks(self._last_packet)
         packet_s = ticks * 1e-6 if ticks is not None else None
         self.facts = read_difop(difop, model, packet_s)
-        setup = self.facts.setup
+        setup, offered = self.facts.setup, self._offered
         if setup is None or (self._setup is not None and setup.agrees_with(self._setup)):
+            self._offered = None
             return []
-        self._setup = setup
+        if self._setup is not None and (offered is None or not setup.agrees_with(offered)):
+            self._offered = setup  # a change is believed when it is told twice
+            return []
+        self._setup, self._offered = setup, None
         scans = self._begin_turns()
         waiting, self._waiting = self._waiting, deque()
         for datagram in waiting:

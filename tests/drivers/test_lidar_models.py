@@ -250,6 +250,19 @@ def test_the_two_helios_are_told_apart_by_their_calibration(lasers: int, model: 
     assert wrong.bad == {"model": 1, "uncalibrated": 1}
 
 
+def test_a_change_of_the_setup_is_believed_when_told_twice() -> None:
+    decoder = RobosenseDecoder()
+    scans = feed_only(decoder, [helios_difop(32), helios_packet(START_US, 0, 20), helios_difop(32, mode=0)])
+    assert scans == []
+    scans = feed_only(decoder, [helios_difop(32, mode=0), helios_packet(START_US + 667, 240, 20)])
+    assert [scan.packets_received for scan in scans] == [1]  # of before, with the setup there was
+    assert decoder.finish()[0].packets_expected == 300
+
+
+def feed_only(decoder: RobosenseDecoder, packets: list[bytes]) -> list[ScanSample]:
+    return [scan for one in packets for scan in decoder.feed(one)]
+
+
 @pytest.mark.parametrize(("is_dual", "block_us"), [(False, 111.12), (True, 55.56)])
 def test_times_and_rings_of_a_helios_16p(is_dual: bool, block_us: float) -> None:
     setup = Setup(np.arange(16) * 100 - 750, np.zeros(16, np.int64), is_dual=is_dual)
@@ -376,3 +389,24 @@ def test_any_bytes_to_the_imu(datas: list[bytes], model: str, shaped: bool) -> N
             data = (magic + data + bytes(256))[: 51 if model == "airy" else 256]
         for sample in decoder.feed(data):
             assert sample.accel_m_s2 is not None
+
+
+NAMES = ("m1_dual", "m2_basic", "m3_basic", "e1_basic", "airy_dual_side", "rs16_single")
+STREAMS = [one for name in NAMES for one in datagrams(name)[:20]] + [helios_difop(32), helios_difop(16)]
+STREAMS += [helios_packet(START_US + number * 667, number * 240, 20) for number in range(30)]
+
+
+@given(st.sampled_from([None, *MODELS]), st.data())
+@settings(deadline=None, max_examples=60)
+def test_mutated_datagrams_of_all_models(key: str | None, data: st.DataObject) -> None:
+    decoder = RobosenseDecoder(MODELS[key] if key else None)
+    scans: list[ScanSample] = []
+    for _ in range(data.draw(st.integers(0, 60))):
+        one = bytearray(data.draw(st.sampled_from(STREAMS)))
+        for _ in range(data.draw(st.integers(0, 3))):
+            one[data.draw(st.integers(0, min(len(one), 60) - 1))] = data.draw(st.integers(0, 255))
+        mutated = bytes(one[: data.draw(st.sampled_from([len(one)] * 9 + [0, 50, 256, 512]))])
+        scans += decoder.feed(mutated)
+        assert len(decoder.bad) <= 9
+    scans += decoder.finish()
+    assert all(np.isfinite(scan.points["x"]).all() for scan in scans)
