@@ -92,7 +92,7 @@ def decode(rounds: int) -> None:
                 million_points_s=len(packets) * M1.points_per_packet / frame_s / 1e6,
                 memcpy_million_points_s=len(result) / memcpy_s / 1e6,
                 ratio_to_memcpy=memcpy_s / frame_s * len(packets) * M1.points_per_packet / len(result),
-                ratio_asked=asked,
+                ratio_asked=asked if name == "scene" else None,
             )
 
 
@@ -168,8 +168,8 @@ def record_one(folder: Path, duration_s: float) -> None:
     )
 
 
-def try_multiple(folder: Path, multiple: float, duration_s: float) -> bool:
-    """Receive, decode and write so many times an M1's rate; whether nothing was lost."""
+def try_multiple(folder: Path, multiple: float, duration_s: float, write: str) -> bool:
+    """Receive and decode so many times an M1's rate, and write scans and tape or not; whether nothing was lost."""
     ports = free_ports()
     entry = {"driver": "robosense", "address": LIDAR, "msop_port": ports[0], "difop_port": ports[1]}
     driver = DRIVER.create("lidar", msgspec.convert(entry, RobosenseConfig))
@@ -183,13 +183,15 @@ def try_multiple(folder: Path, multiple: float, duration_s: float) -> bool:
         begin = (time.monotonic(), time.process_time())
         threading.Timer(duration_s + 2.0, stop.set).start()
         for item in driver.read(stop):
-            raw.put_chunks("lidar", item.chunks)
+            if write == "all":
+                raw.put_chunks("lidar", item.chunks)
             lost += sum(event.count for event in item.events if event.kind in ("drop", "gap"))
             for _, sample in item.samples:
                 if isinstance(sample, ScanSample):
                     points += len(sample.points)
                     packets += sample.packets_received
-                    scans.put(sample.points)
+                    if write != "none":
+                        scans.put(sample.points)
         driver.close()
         sent = json.loads(process.communicate()[0])
     cpu_s = time.process_time() - begin[1]
@@ -200,6 +202,7 @@ def try_multiple(folder: Path, multiple: float, duration_s: float) -> bool:
     print_line(
         measure="multiple",
         multiple=multiple,
+        writes=write,
         seconds=sent["seconds"],
         sent=sent["sent"],
         decoded=packets,
@@ -222,6 +225,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
     parser.add_argument("--folder", type=Path, help="where to write (default: a temporary folder)")
     parser.add_argument("--multiples", type=float, nargs="*", help="multiples of an M1's rate to try")
+    parser.add_argument("--write", choices=["none", "scans", "all"], default="all", help="scans, or the raw tape too")
     parser.add_argument("--seconds", type=float, help="how long each (default 20)")
     parser.add_argument("--send", nargs=4, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -238,7 +242,7 @@ def main() -> None:
         for multiple in multiples:
             part = folder / str(multiple)
             part.mkdir()
-            if not try_multiple(part, multiple, seconds):
+            if not try_multiple(part, multiple, seconds, arguments.write):
                 break
             largest = multiple
             shutil.rmtree(part)

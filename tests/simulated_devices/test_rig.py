@@ -246,7 +246,7 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
         ("simulate.colour=1", ["simulate.colour", "allowed: jitter, seed, skew_ppm, trajectory"]),
         ("simulate.seed=-1", ["simulate.seed"]),
         ("simulate.trajectory=slow", ["simulate.trajectory", "brisk, gentle"]),
-        ("devices.imu.driver=oak", ["devices.imu.driver", "nmea, pose, robosense, stream, xsens"]),
+        ("devices.imu.driver=oak", ["devices.imu.driver", "nmea, pose, robosense, robosense-imu, stream, xsens"]),
         ("devices.imu.rate_hz=300", ["devices.imu.rate_hz", "200, 400"]),
         ("devices.gnss.baud=fast", ["devices.gnss.baud", "int"]),
         ("devices.left.width=33", ["devices.left.width", "even"]),
