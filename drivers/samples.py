@@ -79,7 +79,7 @@ class PoseSample:
 class VideoFormat:
     """How a camera's pictures are coded: codec by its FFmpeg name, size and rate.
 
-    extradata: the codec's headers where the stream carries them apart from the packets. pixel_format: FFmpeg name.
+    pixel_format: FFmpeg name. The codec's headers are in the packets of key frames.
     """
 
     codec: str
@@ -87,7 +87,6 @@ class VideoFormat:
     height: int
     fps: float
     pixel_format: str
-    extradata: bytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,7 +114,7 @@ class Twin:
         fps = self._rate_hz(name, "fps", 20)
         renderer = CameraRenderer(self._cast.room, camera, seed=self._cast.stage.seed_for("camera", name))
         encoder = PictureEncoder(ClientStream(), camera.width, camera.height, fps)
-        video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p", b"")
+        video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p")
         for times_ns in self._times(fps, FRAMES_AFTER_IMU_NS):
             rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             for index, time_ns in enumerate(times_ns.tolist()):

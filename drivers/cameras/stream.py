@@ -149,7 +149,7 @@ class StreamDriver:
         if context.has_b_frames:
             raise self._b_frames()
         self._headers = _HeadersInBand(codec, stream)
-        return VideoFormat(codec, context.width, context.height, self._config.fps, context.pix_fmt or "", b"")
+        return VideoFormat(codec, context.width, context.height, self._config.fps, context.pix_fmt or "")
 
     def _b_frames(self) -> DeviceError:
         return DeviceError(

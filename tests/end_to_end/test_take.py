@@ -97,7 +97,9 @@ def test_pictures_agree_with_the_ground_truth(take: Path, lines: list[dict]) -> 
             errors.append(np.square(renderer.render(turned, moved).astype(float) - pictures[k]).mean())
         found_s.append(vertex(offsets_s, errors))
     clocks = json.loads((take / "recording.json").read_text())["clocks"]
-    sigma_s = sum(clocks[name]["uncertainty_us"] for name in ("cameras", "imu")) * 1e-6  # more on a machine that is busy
+    sigma_s = (
+        sum(clocks[name]["uncertainty_us"] for name in ("cameras", "imu")) * 1e-6
+    )  # more on a machine that is busy
     assert np.abs(found_s).max() < 1e-3 + 3 * sigma_s, clocks
 
 

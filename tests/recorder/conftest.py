@@ -45,7 +45,7 @@ def _encoded(count: int, width: int, height: int) -> list[tuple[bytes, bool]]:
 
 
 def _pictures(count: int, *, width: int = 64, height: int = 48) -> list[FrameSample]:
-    video = VideoFormat("h264", width, height, 20.0, "yuv420p", b"")
+    video = VideoFormat("h264", width, height, 20.0, "yuv420p")
     return [
         FrameSample(index * PERIOD_NS, packet, is_keyframe, video, None)
         for index, (packet, is_keyframe) in enumerate(_encoded(count, width, height))

@@ -408,7 +408,7 @@ def fates_of(rng, count):
     return [Fate(str(kind), int(delay_ms) * MS) for kind, delay_ms in zip(kinds, delays_ms, strict=True)]
 
 
-VIDEO = VideoFormat("h264", 64, 48, 20.0, "yuv420p", b"")
+VIDEO = VideoFormat("h264", 64, 48, 20.0, "yuv420p")
 
 
 class Recorded:

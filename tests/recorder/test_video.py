@@ -148,7 +148,7 @@ def test_a_change_of_codec_is_refused_too(tmp_path, pictures):
     told = Told()
     writer = told.writer(tmp_path / "data.mkv")
     first, second = pictures(2)
-    mjpeg = VideoFormat("mjpeg", 64, 48, 20.0, "gray", b"")
+    mjpeg = VideoFormat("mjpeg", 64, 48, 20.0, "gray")
     other = FrameSample(second.device_ticks, b"\xff\xd8", True, mjpeg, None)
     tickets = put_all(writer, [first, other])
     writer.close()
