@@ -19,7 +19,7 @@ from typing import Protocol
 
 from drivers.datagrams import USER0, DatagramDecoder
 from drivers.device import DeviceError
-from drivers.links import SerialPort, UdpPorts
+from drivers.links import SerialPort, UdpOptions, UdpPorts
 from drivers.pcap import BUFFER_BYTES, NS_PER_S, CaptureError, CaptureFile, is_capture
 from drivers.samples import Chunk, DeviceEvent
 
@@ -244,11 +244,11 @@ class CaptureLinks:
         self._jump(_is_serial)
         return CaptureSerialPort(self)
 
-    def udp(self, address: str, ports: tuple[int, ...]) -> UdpPorts:
+    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
         """Datagrams to these ports, from the next one on. Raises DeviceError when it is over."""
         if not self.capture.has_arrivals:
             raise DeviceError(f"{self.capture.path}: is no pcap or pcapng, and this device sends datagrams")
-        opened = CaptureUdpPorts(self, address, ports)
+        opened = CaptureUdpPorts(self, address, ports, options.source_port if options else 0)
         self._jump(opened.is_wanted)
         return opened
 
@@ -371,8 +371,9 @@ class CaptureUdpPorts:
     kernel_drops = 0
     receive_buffer_bytes = 1 << 40
 
-    def __init__(self, links: CaptureLinks, address: str, ports: tuple[int, ...]) -> None:
+    def __init__(self, links: CaptureLinks, address: str, ports: tuple[int, ...], source_port: int = 0) -> None:
         self.address = address
+        self.source_port = source_port
         self.foreign = 0
         self._links = links
         self._ports = frozenset(ports)
@@ -381,7 +382,7 @@ class CaptureUdpPorts:
         """Whether a datagram is of this device; counts strangers."""
         if chunk.source is None or chunk.destination is None or chunk.destination[1] not in self._ports:
             return False
-        if chunk.source[0] != self.address:
+        if chunk.source[0] != self.address or self.source_port not in (0, chunk.source[1]):
             self.foreign += 1
             return False
         return True

@@ -15,80 +15,50 @@ import select
 import socket
 import struct
 import termios
+import threading
 import time
-from dataclasses import dataclass
-from typing import Protocol
+from collections import deque
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import repeat
 
+import numpy as np
 import serial
 
 from drivers.device import DeviceError
-from drivers.samples import Chunk, DeviceEvent
+from drivers.garbage import CountsBadInput, GarbageWatch
+from drivers.ports import Links, SerialPort, UdpOptions, UdpPorts
+from drivers.samples import Chunk
+from drivers.udp_batches import SLOTS, BatchReceiver
+
+__all__ = [
+    "LIVE",
+    "SILENCE_S",
+    "CountsBadInput",
+    "GarbageWatch",
+    "Links",
+    "LiveLinks",
+    "SerialLink",
+    "SerialPort",
+    "UdpLink",
+    "UdpOptions",
+    "UdpPorts",
+]
 
 READ_BYTES = 65536
 DATAGRAM_BYTES = 65535
 DATAGRAMS_PER_READ = 512
+GIVEN_DATAGRAMS = 20_000
 RECEIVE_BUFFER_BYTES = 32 << 20
 SILENCE_S = 3.0
 WRITE_TIMEOUT_S = 2.0
 WALL_CLOCK_STEP_NS = 1_000_000
-BURST_END_NS = 1_000_000_000
-BURST_MAX_NS = 10_000_000_000
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
 _TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
-
-
-class SerialPort(Protocol):
-    """A serial line as drivers use it, see SerialLink."""
-
-    def read(self, timeout_s: float) -> tuple[int, bytes]:
-        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError."""
-
-    def discard_input(self) -> None:
-        """Throw away what waits unread and came at a time that is not known. Raises DeviceError."""
-
-    def write(self, data: bytes) -> Chunk:
-        """Send bytes; gives the chunk for the tape. Raises DeviceError."""
-
-    def close(self) -> None:
-        """Close the port."""
-
-
-class UdpPorts(Protocol):
-    """The UDP ports of one device as drivers use them, see UdpLink."""
-
-    address: str
-    foreign: int
-    kernel_drops: int
-    receive_buffer_bytes: int
-
-    def read(self, timeout_s: float) -> list[Chunk]:
-        """What has come on all ports, in order of arrival; empty after `timeout_s`. Raises DeviceError."""
-
-    def close(self) -> None:
-        """Close all ports."""
-
-
-class Links(Protocol):
-    """What a driver reaches the world through: links to its device, and the time on whose clock arrivals are."""
-
-    def serial(self, port: str, baud: int) -> SerialPort:
-        """Open a serial port. Raises DeviceError."""
-
-    def udp(self, address: str, ports: tuple[int, ...]) -> UdpPorts:
-        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
-
-    def monotonic_ns(self) -> int:
-        """The time now, on the clock of arrivals."""
-
-    def utc_ns(self) -> int:
-        """UTC now, in nanoseconds since 1970."""
-
-    def sleep(self, duration_s: float) -> None:
-        """Let time pass."""
 
 
 class SerialLink:
@@ -161,28 +131,61 @@ class UdpLink:
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
-    def __init__(self, address: str, ports: tuple[int, ...]) -> None:
-        """Bind the ports. Raises DeviceError when one is taken or the address is not an IPv4 address."""
+    def __init__(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> None:
+        """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address."""
+        options = options or UdpOptions()
         self.address = address
+        self.source_port = options.source_port
         self.foreign = 0
+        self._given: deque[Chunk] = deque(maxlen=GIVEN_DATAGRAMS)
+        self._shared: dict[int, _SharedPort] = {}
         self.kernel_drops = 0
         self._drops_by_socket: dict[int, int] = {}
         self._sockets: dict[int, socket.socket] = {}
         self._readable = select.poll()
         self._realtime_minus_monotonic_ns = _realtime_minus_monotonic_ns()
         try:
-            packed = socket.inet_pton(socket.AF_INET, address)
-        except OSError as error:
-            raise DeviceError(f"address {address!r}: not an IPv4 address") from error
-        bind_address = "127.0.0.1" if packed[0] == 127 else "0.0.0.0"
+            self._batches: BatchReceiver | None = BatchReceiver()
+        except OSError:
+            self._batches = None
+        member = b""
+        if options.multicast_group:
+            member = _packed_ipv4(options.multicast_group) + _packed_ipv4(options.interface or "0.0.0.0")
+        bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not options.multicast_group else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
-            udp = self._bind(bind_address, port)
+            udp = self._share(bind_address, port) if options.shared else self._bind(bind_address, port)
             self._sockets[udp.fileno()] = udp
             self._readable.register(udp, select.POLLIN)
+            if options.multicast_group:
+                self._join(udp, member, options)
         self.receive_buffer_bytes = min(
             bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for bound in self._sockets.values()
         )
+
+    def _share(self, bind_address: str, port: int) -> socket.socket:
+        """The socket that all links of this process with this port use."""
+        with _shared_ports_lock:
+            entry = _shared_ports.get((bind_address, port))
+            if entry is None:
+                udp = self._bind(bind_address, port)
+                entry = _shared_ports[bind_address, port] = _SharedPort(udp, (bind_address, port))
+            entry.links.append(self)
+            self._shared[entry.udp.fileno()] = entry
+        return entry.udp
+
+    def _join(self, udp: socket.socket, member: bytes, options: UdpOptions) -> None:
+        try:
+            udp.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:  # another link of this port has joined already
+                self.close()
+                where = f" on {options.interface}" if options.interface else ""
+                raise DeviceError(f"multicast group {options.multicast_group}{where}: {_reason(error)}") from error
+
+    def accepts(self, source: tuple[str, int]) -> bool:
+        """Whether a datagram from there is of this link's device."""
+        return source[0] == self.address and self.source_port in (0, source[1])
 
     def _bind(self, bind_address: str, port: int) -> socket.socket:
         udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -203,8 +206,8 @@ class UdpLink:
 
     def read(self, timeout_s: float) -> list[Chunk]:
         """What has come on all ports, in order of arrival; empty after `timeout_s`."""
-        events = self._readable.poll(_milliseconds(timeout_s))
-        if not events:
+        events = self._readable.poll(0 if self._given else _milliseconds(timeout_s))
+        if not events and not self._given:
             return []
         offset_ns = _realtime_minus_monotonic_ns()
         wall_clock_was_set = abs(offset_ns - self._realtime_minus_monotonic_ns) > WALL_CLOCK_STEP_NS
@@ -212,12 +215,65 @@ class UdpLink:
         chunks: list[Chunk] = []
         for descriptor, _ in events:
             # What waits may have been stamped before the wall clock was set: then the time of reading is the truth.
-            self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns, chunks)
-        if len(events) > 1:
+            with self._shared[descriptor].lock if descriptor in self._shared else contextlib.nullcontext():
+                self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns, chunks)
+        given = bool(self._given)
+        while self._given:
+            chunks.append(self._given.popleft())
+        if len(events) > 1 or given:
             chunks.sort(key=lambda chunk: chunk.arrival_ns)
         return chunks
 
     def _drain(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
+        """Read what waits on one socket, by the batch where the system can."""
+        if self._batches is None or not isinstance(udp, socket.socket):
+            self._drain_singly(udp, offset_ns, chunks)
+            return
+        destination: tuple[str, int] = udp.getsockname()
+        is_alone = udp.fileno() not in self._shared or len(self._shared[udp.fileno()].links) == 1
+        for _ in range(0, DATAGRAMS_PER_READ, SLOTS):
+            try:
+                batch = self._batches.receive(udp)
+            except OSError as error:
+                if error.errno == errno.ECONNREFUSED:  # a late answer to something sent, not about what comes
+                    continue
+                raise DeviceError(f"UDP port {destination[1]}: {_reason(error)}") from error
+            if batch is None:
+                return
+            now_ns = time.monotonic_ns()
+            if batch.drops is not None:
+                self._count_kernel_drops(udp.fileno(), batch.drops)
+            arrivals_ns = batch.stamp_ns - (offset_ns or 0)
+            # A wall clock that was set in this very moment would show as the future or the far past.
+            is_credible = (arrivals_ns > now_ns - 10_000_000_000) & (arrivals_ns <= now_ns) & (offset_ns is not None)
+            stamps_ns = np.where(is_credible, arrivals_ns, now_ns).tolist()
+            first = _source(batch.source[0])
+            if is_alone and len(set(batch.source)) == 1 and self.accepts(first):
+                chunks += map(Chunk, stamps_ns, batch.data, repeat(first), repeat(destination))
+            else:
+                for arrival_ns, data, number in zip(stamps_ns, batch.data, batch.source, strict=True):
+                    self._accept(udp, arrival_ns, data, _source(number), destination, chunks)
+            if len(batch.data) < SLOTS:
+                return
+
+    def _accept(
+        self,
+        udp: socket.socket,
+        arrival_ns: int,
+        data: bytes,
+        source: tuple[str, int],
+        destination: tuple[str, int],
+        chunks: list[Chunk],
+    ) -> None:
+        """Put a datagram where it belongs."""
+        if self._shared and len(self._shared[udp.fileno()].links) > 1:
+            self._deal_out(udp, Chunk(arrival_ns, data, source, destination), chunks)
+        elif self.accepts(source):
+            chunks.append(Chunk(arrival_ns, data, source, destination))
+        else:
+            self.foreign += 1
+
+    def _drain_singly(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
         destination = udp.getsockname()
         for _ in range(DATAGRAMS_PER_READ):
             try:
@@ -238,21 +294,73 @@ class UdpLink:
                         arrival_ns = stamp_ns
                 elif kind == SO_RXQ_OVFL:
                     self._count_kernel_drops(udp.fileno(), _UINT32.unpack_from(payload)[0])
-            if source[0] != self.address:
-                self.foreign += 1
-                continue
-            chunks.append(Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination))
+            self._accept(udp, arrival_ns, bytes(self._buffer[:size]), source, destination, chunks)
+
+    def _deal_out(self, udp: socket.socket, chunk: Chunk, chunks: list[Chunk]) -> None:
+        """Give a datagram to all links that accept it; one that nobody accepts is foreign to the one that read it."""
+        assert chunk.source is not None
+        takers = [link for link in self._shared[udp.fileno()].links if link.accepts(chunk.source)]
+        self.foreign += not takers
+        for link in takers:
+            if link is self:
+                chunks.append(chunk)
+            else:
+                link._given.append(chunk)  # noqa: SLF001
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
-        self.kernel_drops += (total - self._drops_by_socket.get(descriptor, 0)) & 0xFFFFFFFF
-        self._drops_by_socket[descriptor] = total
+        seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket
+        self.kernel_drops += (total - seen.get(descriptor, 0)) & 0xFFFFFFFF
+        seen[descriptor] = total
 
     def close(self) -> None:
-        """Close all sockets."""
+        """Close all sockets that no other link uses."""
         for descriptor, udp in self._sockets.items():
             self._readable.unregister(descriptor)
-            udp.close()
+            if descriptor in self._shared:
+                self._shared[descriptor].leave(self)
+            else:
+                udp.close()
         self._sockets.clear()
+        self._shared.clear()
+
+
+@dataclass(slots=True, eq=False)
+class _SharedPort:
+    """One socket for all links of this process that share its port. The one who reads deals out to the others.
+
+    drops_seen: what the kernel has told of drops; they count for the link that happened to read it.
+    """
+
+    udp: socket.socket
+    key: tuple[str, int]
+    links: list["UdpLink"] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    drops_seen: dict[int, int] = field(default_factory=dict)
+
+    def leave(self, link: "UdpLink") -> None:
+        """The last one closes the socket."""
+        with _shared_ports_lock:
+            self.links.remove(link)
+            if not self.links:
+                del _shared_ports[self.key]
+                self.udp.close()
+
+
+_shared_ports: dict[tuple[str, int], _SharedPort] = {}
+_shared_ports_lock = threading.RLock()
+
+
+@lru_cache(maxsize=4096)
+def _source(number: int) -> tuple[str, int]:
+    """Address and port of one number."""
+    return socket.inet_ntoa((number >> 16).to_bytes(4)), number & 0xFFFF
+
+
+def _packed_ipv4(address: str) -> bytes:
+    try:
+        return socket.inet_pton(socket.AF_INET, address)
+    except OSError as error:
+        raise DeviceError(f"address {address!r}: not an IPv4 address") from error
 
 
 class LiveLinks:
@@ -262,9 +370,9 @@ class LiveLinks:
         """Open a serial port. Raises DeviceError."""
         return SerialLink(port, baud)
 
-    def udp(self, address: str, ports: tuple[int, ...]) -> UdpPorts:
+    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
         """Open UDP ports for the datagrams of one address. Raises DeviceError."""
-        return UdpLink(address, ports)
+        return UdpLink(address, ports, options)
 
     def monotonic_ns(self) -> int:
         """The host's monotonic clock."""
@@ -280,41 +388,6 @@ class LiveLinks:
 
 
 LIVE: Links = LiveLinks()
-
-
-class CountsBadInput(Protocol):
-    """A decoder: it counts what it could not use."""
-
-    bad_frames: int
-    skipped_bytes: int
-
-
-@dataclass(slots=True)
-class GarbageWatch:
-    """Turns a decoder's counters of bad input into one event per burst (ended by a second without any).
-
-    A burst that does not end is told every ten seconds.
-    """
-
-    decoder: CountsBadInput
-    _reported: tuple[int, int] = (0, 0)
-    _seen: tuple[int, int] = (0, 0)
-    _begin_ns: int = 0
-    _last_growth_ns: int = 0
-
-    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
-        """The event of a burst that is over, else nothing."""
-        counters = (self.decoder.bad_frames, self.decoder.skipped_bytes)
-        if counters != self._seen:
-            if self._seen == self._reported:
-                self._begin_ns = now_ns
-            self._seen, self._last_growth_ns = counters, now_ns
-        is_over = now_ns - self._last_growth_ns >= BURST_END_NS or now_ns - self._begin_ns >= BURST_MAX_NS
-        if self._seen == self._reported or not is_over:
-            return ()
-        frames, skipped = (new - old for new, old in zip(self._seen, self._reported, strict=True))
-        self._reported = self._seen
-        return (DeviceEvent("garbage", f"{frames} bad frames, {skipped} bytes skipped", frames or skipped),)
 
 
 def _realtime_minus_monotonic_ns() -> int:

@@ -122,6 +122,7 @@ class ScanSample:
     first_ticks, last_ticks: device time of the first and last packet present.
     packets_expected counts what the device sends for one frame, packets_received what came, duplicates apart.
     is_partial: the stream began inside this frame. model: name of the point format in the recording.
+    points_expected: points of so many packets, invalid ones included; 0: not known.
     """
 
     points: npt.NDArray[np.void]
@@ -132,6 +133,7 @@ class ScanSample:
     duplicates: int
     is_partial: bool
     model: str = "RoboSense M1 XYZIRT"
+    points_expected: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

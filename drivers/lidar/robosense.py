@@ -1,6 +1,6 @@
 """RoboSense lidars over UDP: measurement packets (MSOP) on one port, information packets (DIFOP) on another.
 
-Datagrams wait in the socket's buffer for a few milliseconds and are then taken together: one wake-up for some twenty
+Datagrams wait in the socket's buffer for a few milliseconds and are then taken together: one wake-up for some sixty
 of them, while each keeps the kernel's time of its arrival.
 """
 
@@ -12,48 +12,61 @@ import numpy as np
 from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
-from drivers.lidar.robosense_decoder import (
-    DUAL_RETURN,
-    M1,
-    M1Decoder,
-    difop_identity,
-    is_difop,
-    is_measurement,
-    packet_ticks,
-)
-from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, UdpPorts
-from drivers.samples import Chunk, ClockPairs, DeviceEvent, Received, Sample, ScanSample
+from drivers.lidar import fast
+from drivers.lidar.difop import destination, helios_lasers, is_difop
+from drivers.lidar.models import HELIOS, M1, MODELS, Model, ModelKey, SequencedModel, SpinningModel, recognise
+from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
+from drivers.lidar.slots import DUAL_RETURN
+from drivers.lidar.watches import BadPacketWatch, LossWatch, SetupWatch
+from drivers.links import LIVE, SILENCE_S, Links, UdpOptions, UdpPorts
+from drivers.samples import POINT_DTYPE, Chunk, ClockPairs, DeviceEvent, Received, Sample, ScanSample
 
 FIRST_PACKET_S = 3.0
 DIFOP_PERIOD_S = 1.1
-"""An M1 tells of itself once a second, an M1P ten times."""
-HELD_DATAGRAMS = 20_000
-COLLECT_S = 0.004
+"""Most lidars tell of themselves once a second, an M1P ten times."""
+HELD_DATAGRAMS = 30_000
+COLLECT_S = 0.010
+"""Datagrams are taken together after so long, or after a quarter of what the socket's buffer holds."""
+PAIRS_EVERY_NS = 50_000_000
 BATCH_DATAGRAMS = 512
-BURST_QUIET_NS = 10_000_000_000
-BYTES_PER_S = 18.1e6 + 8e6
+TAPE_BYTES_PER_PACKET = 60
 PACKET_SOCKET_BYTES = 2304
-"""What the kernel charges for one datagram of 1210 bytes."""
+"""What the kernel charges for one datagram of 1025 to 1500 bytes."""
 
 Port = Annotated[int, Meta(ge=1, le=65535)]
-Ipv4Address = Annotated[str, Meta(pattern=r"^\d{1,3}(\.\d{1,3}){3}\Z")]
+IPV4 = r"^\d{1,3}(\.\d{1,3}){3}\Z"
+Ipv4Address = Annotated[str, Meta(pattern=IPV4)]
+Ipv4OrNone = Annotated[str, Meta(pattern=rf"^\Z|{IPV4}")]
+LayerBytes = Annotated[int, Meta(ge=0, le=1000)]
 
 
 class RobosenseConfig(DeviceConfig, frozen=True, kw_only=True):
     """Keys of a RoboSense lidar.
 
     address: the lidar's own IPv4 address; datagrams of others are ignored. msop_port, difop_port: where it sends to.
+    source_port: where it sends from; 0: from any (several lidars may share an address, as behind a router, or a port).
+    multicast_group: the group it sends to, with interface: this host's address in that network; empty: not multicast.
+    model: m1 (also M1P), m2, m3, e1 (also E1R), airy, helios32, helios16p, rs16; not given: recognised.
     min_range_m, max_range_m: points outside are invalid (both ends included; default: the model's own limits).
     keep_invalid: write invalid points too, with NaN coordinates. rate_hz: frames per second.
+    cut_angle_deg: azimuth at which the frames of a spinning lidar begin.
+    user_layer_bytes, tail_layer_bytes: what stands around the packet in each datagram.
     """
 
     address: Ipv4Address
     msop_port: Port = 6699
     difop_port: Port = 7788
+    source_port: Annotated[int, Meta(ge=0, le=65535)] = 0
+    multicast_group: Ipv4OrNone = ""
+    interface: Ipv4OrNone = ""
+    model: ModelKey | None = None
     min_range_m: Annotated[float, Meta(ge=0)] | None = None
     max_range_m: Annotated[float, Meta(gt=0)] | None = None
     keep_invalid: bool = False
     rate_hz: Annotated[float, Meta(gt=0)] = 10.0
+    cut_angle_deg: Annotated[float, Meta(ge=0, lt=360)] = 0.0
+    user_layer_bytes: LayerBytes = 0
+    tail_layer_bytes: LayerBytes = 0
 
     def __post_init__(self) -> None:
         if self.msop_port == self.difop_port:
@@ -72,39 +85,96 @@ class RobosenseDriver:
         """Nothing is opened yet."""
         self.links: Links = LIVE
         self._config = config
-        self.streams = (StreamSpec("lidar", config.rate_hz, BYTES_PER_S),)
+        self._named = MODELS[config.model] if config.model is not None else None
+        self.streams = (StreamSpec("lidar", config.rate_hz, _bytes_per_s(self._named or M1)),)
         self._link: UdpPorts | None = None
-        self._decoder = M1Decoder()
+        self._options = PointOptions(
+            min_range_m=config.min_range_m,
+            max_range_m=config.max_range_m,
+            keep_invalid=config.keep_invalid,
+            cut_angle_deg=config.cut_angle_deg,
+            user_layer_bytes=config.user_layer_bytes,
+            tail_layer_bytes=config.tail_layer_bytes,
+        )
+        self._decoder = RobosenseDecoder()
         self._held: list[Chunk] = []
+        self._ticks: list[int] = []
+        self._ticks_arrivals_ns: list[int] = []
 
     @property
     def identity(self) -> dict[str, str]:
-        """Model, and what the lidar's DIFOP says."""
-        if self._link is None:
+        """Model, and what the lidar's packets say of it."""
+        decoder = self._decoder
+        if self._link is None or decoder.model is None:
             return {}
-        return {"model": M1.name, "address": self._config.address, **difop_identity(self._decoder.difop)}
+        known = {"model": decoder.model.name, "address": self._config.address, **decoder.facts.identity()}
+        celsius = decoder.temperature_c
+        return known if celsius is None else known | {"temperature_c": f"{celsius:.1f}"}
 
     def connect(self) -> None:
         """Open the ports and wait for the first measurement packet. Raises DeviceError with what to check."""
-        config = self._config
         self.close()
-        self._link = link = self.links.udp(config.address, (config.msop_port, config.difop_port))
-        self._decoder = M1Decoder(config.min_range_m, config.max_range_m, config.keep_invalid)
-        self._garbage = GarbageWatch(self._decoder)
-        self._losses = _LossWatch(self._decoder, link)
-        self._held = []
-        first = self._wait_for(link, is_measurement, FIRST_PACKET_S)
-        if first is None:
-            message = self._no_packet(link)
+        self._link = link = self._open()
+        self._held, self._ticks, self._ticks_arrivals_ns = [], [], []
+        try:
+            model, difop, self._connect_events = self._meet(link)
+        except DeviceError:
             self.close()
-            raise DeviceError(message)
-        self._connect_events = _buffer_advice(link, first)
+            raise
+        if isinstance(model, SequencedModel):
+            fast.warm_up(model)
+        self._decoder = decoder = RobosenseDecoder(model, self._options)
+        self._bad_packets, self._losses = BadPacketWatch(decoder), LossWatch(decoder, link)
+        self._setup_changes = SetupWatch(decoder)
+        if difop is not None:
+            decoder.feed(difop)
+
+    def _open(self) -> UdpPorts:
+        config = self._config
+        ports = (config.msop_port, config.difop_port)
+        options = UdpOptions(config.source_port, config.multicast_group, config.interface, shared=True)
+        return self.links.udp(config.address, ports, options)
+
+    def _meet(self, link: UdpPorts) -> tuple[Model, bytes | None, list[DeviceEvent]]:
+        """Wait for the lidar; gives its model, an information packet, and what a user should know."""
+        config = self._config
+        first = self._wait_for(link, lambda data: recognise(data) is not None, FIRST_PACKET_S)
+        if first is None:
+            raise DeviceError(self._no_packet(link))
+        data = self._packet(first)
+        found = recognise(data)
+        assert found is not None
         difop = self._wait_for(link, is_difop, DIFOP_PERIOD_S)
+        model = self._agreed_model(found, self._packet(difop) if difop is not None else b"")
+        is_dual = isinstance(model, SequencedModel) and data[8] == DUAL_RETURN
+        held_s = link.receive_buffer_bytes / (model.packets_per_s * (2 if is_dual else 1) * PACKET_SOCKET_BYTES)
+        self._collect_s = min(COLLECT_S, held_s / 4)
+        events = _buffer_advice(held_s)
         if difop is None:
-            text = f"no information packet on UDP port {config.difop_port}: serial number and firmware are not known"
-            self._connect_events.append(DeviceEvent("info", text))
-        else:
-            self._decoder.feed(difop.data)
+            text = f"no information packet on UDP port {config.difop_port}"
+            if isinstance(model, SpinningModel):
+                raise DeviceError(f"{config.address}: {text}; a {model.name} has no points without")
+            events.append(DeviceEvent("info", f"{text}: serial number and firmware are not known"))
+        return model, difop.data if difop is not None else None, events
+
+    def _agreed_model(self, found: Model, difop: bytes) -> Model:
+        """The model the packets are of. Raises DeviceError when another one is configured."""
+        named = self._named
+        if found in HELIOS:  # a 32 and a 16P differ in their calibration only
+            lasers = helios_lasers(difop)
+            default = named if named in HELIOS else found
+            found = next((one for one in HELIOS if one.lasers == lasers), default)
+        if named is not None and found is not named:
+            raise DeviceError(
+                f"{self._config.address}: model: {named.key} ({named.name}) is configured, but the packets are of a "
+                f"{found.name} (model: {found.key})"
+            )
+        return found
+
+    def _packet(self, chunk: Chunk) -> bytes:
+        """The lidar's packet in a datagram."""
+        config = self._config
+        return chunk.data[config.user_layer_bytes : max(0, len(chunk.data) - config.tail_layer_bytes)]
 
     def _wait_for(self, link: UdpPorts, wanted: Callable[[bytes], bool], timeout_s: float) -> Chunk | None:
         """Hold what comes until something wanted is among it; None after `timeout_s`."""
@@ -112,7 +182,7 @@ class RobosenseDriver:
         looked_at = 0
         while True:
             for chunk in self._held[looked_at:]:
-                if wanted(chunk.data):
+                if wanted(self._packet(chunk)):
                     return chunk
             looked_at = len(self._held)
             left_ns = deadline_ns - self.links.monotonic_ns()
@@ -123,12 +193,14 @@ class RobosenseDriver:
     def _no_packet(self, link: UdpPorts) -> str:
         config = self._config
         advice = "the lidar's destination address must be this host's, and no firewall may stand between"
-        difop = next((chunk.data for chunk in self._held if is_difop(chunk.data)), None)
+        packets = [self._packet(chunk) for chunk in self._held]
+        difop = next((packet for packet in packets if is_difop(packet)), None)
         if difop is not None:
-            destination, port = ".".join(map(str, difop[14:18])), int.from_bytes(difop[24:26], "big")
-            advice = f"it is there and says that it sends to {destination} port {port}"
-        elif self._held:
-            advice = f"{len(self._held)} datagrams came, of {len(self._held[0].data)} bytes, none is of an M1 or M1P"
+            host, port = destination(difop)
+            advice = f"it is there and says that it sends to {host} port {port}"
+        elif packets:
+            known = ", ".join(sorted(MODELS))
+            advice = f"{len(packets)} datagrams came, of {len(packets[0])} bytes, none is of a known model ({known})"
         return (
             f"no packet from {config.address} on UDP port {config.msop_port} within {FIRST_PACKET_S:.0f} s; {advice}; "
             f"{link.foreign} datagrams came from other addresses"
@@ -140,21 +212,22 @@ class RobosenseDriver:
         assert link is not None
         yield Received(events=tuple(self._connect_events))
         yield from self._backlog(link)
-        last_packet_ns = self.links.monotonic_ns()
+        last_packet_ns, last_arrival_ns = self.links.monotonic_ns(), self._last_arrival_ns
         while not stop.is_set():
             chunks = link.read(0.1)
             now_ns = self.links.monotonic_ns()
             received = self._take(chunks, now_ns)
             if received.chunks or received.events:
                 yield received
-            if any(isinstance(sample, ClockPairs) for _, sample in received.samples):
-                last_packet_ns = now_ns
+            if self._last_arrival_ns != last_arrival_ns:
+                last_packet_ns, last_arrival_ns = now_ns, self._last_arrival_ns
             elif now_ns - last_packet_ns > SILENCE_S * 1e9:
                 break
             if 0 < len(chunks) < BATCH_DATAGRAMS:
-                self.links.sleep(COLLECT_S)
+                self.links.sleep(self._collect_s)
+        last_scans = [(self._last_arrival_ns, scan) for scan in self._decoder.finish()]
         yield Received(
-            samples=tuple((self._last_arrival_ns, scan) for scan in self._decoder.finish()),
+            samples=(*self._pairs(), *last_scans),
             events=self._losses.events(self.links.monotonic_ns()),
         )
         if not stop.is_set():
@@ -174,21 +247,29 @@ class RobosenseDriver:
     def _take(self, chunks: list[Chunk], now_ns: int) -> Received:
         """Decode a batch: first its clock pairs, so that its frames can be placed in time."""
         scans: list[tuple[int, ScanSample]] = []
-        ticks: list[int] = []
-        arrivals_ns: list[int] = []
+        decoder, ticks, arrivals_ns = self._decoder, self._ticks, self._ticks_arrivals_ns
         for chunk in chunks:
-            scans += [(chunk.arrival_ns, scan) for scan in self._decoder.feed(chunk.data)]
-            packet_us = packet_ticks(chunk.data)
-            if packet_us is not None:
-                ticks.append(packet_us)
+            for scan in decoder.feed(chunk.data):
+                scans.append((chunk.arrival_ns, scan))
+            if decoder.last_ticks is not None:
+                ticks.append(decoder.last_ticks)
                 arrivals_ns.append(chunk.arrival_ns)
         samples: list[tuple[int, Sample]] = []
-        if ticks:
+        if arrivals_ns:
             self._last_arrival_ns = arrivals_ns[-1]
-            samples.append((arrivals_ns[0], ClockPairs(np.array(ticks, np.int64), np.array(arrivals_ns, np.int64))))
+            if scans or now_ns - arrivals_ns[0] >= PAIRS_EVERY_NS:
+                samples += self._pairs()
         samples += scans
-        events = self._losses.events(now_ns) + self._garbage.events(now_ns)
+        events = self._losses.events(now_ns) + self._bad_packets.events(now_ns) + self._setup_changes.events()
         return Received(tuple(chunks), tuple(samples), events)
+
+    def _pairs(self) -> list[tuple[int, ClockPairs]]:
+        """The clock pairs since the last ones."""
+        ticks, arrivals_ns = self._ticks, self._ticks_arrivals_ns
+        if not ticks:
+            return []
+        self._ticks, self._ticks_arrivals_ns = [], []
+        return [(arrivals_ns[0], ClockPairs(np.array(ticks, np.int64), np.array(arrivals_ns, np.int64)))]
 
     def close(self) -> None:
         """Release the ports."""
@@ -197,69 +278,16 @@ class RobosenseDriver:
             self._link = None
 
 
-class _LossWatch:
-    """Turns the counters of decoder and link into events.
-
-    The kernel tells how many datagrams it dropped for want of room; they are missing in the frames as well. They are
-    reported as drops, and only what is missing beyond them as a gap, so that the sum of both is what was lost.
-    """
-
-    def __init__(self, decoder: M1Decoder, link: UdpPorts) -> None:
-        self._decoder = decoder
-        self._link = link
-        self._lost = self._restarts = self._kernel_drops = self._foreign = 0
-        self._unexplained_drops = 0
-        self._restart_burst, self._foreign_burst = _Burst(), _Burst()
-
-    def forgive_kernel_drops(self) -> int:
-        """Forget the drops so far; gives their number."""
-        drops, self._kernel_drops = self._link.kernel_drops - self._kernel_drops, self._link.kernel_drops
-        return drops
-
-    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
-        """What is new since the last call."""
-        events: list[DeviceEvent] = []
-        if drops := self.forgive_kernel_drops():
-            self._unexplained_drops += drops
-            text = f"the kernel dropped {drops} datagrams: they were not read in time, or its buffer is too small"
-            events.append(DeviceEvent("drop", text, drops))
-        if lost := self._decoder.lost_packets - self._lost:
-            self._lost += lost
-            explained = min(lost, self._unexplained_drops)
-            self._unexplained_drops -= explained
-            if lost > explained:
-                events.append(DeviceEvent("gap", f"{lost - explained} packets missing in frames", lost - explained))
-        if restarts := self._decoder.restarts - self._restarts:
-            self._restarts += restarts
-            if self._restart_burst.begins(now_ns):
-                text = "the time in the packets jumped, frames start over: its clock was set, or two lidars send here"
-                events.append(DeviceEvent("warning", text, restarts))
-        if foreign := self._link.foreign - self._foreign:
-            self._foreign += foreign
-            if self._foreign_burst.begins(now_ns):
-                text = f"datagrams from other addresses than {self._link.address} are ignored"
-                events.append(DeviceEvent("warning", text, foreign))
-        return tuple(events)
+def _bytes_per_s(model: Model) -> float:
+    """On disk: points, and the raw tape."""
+    point_bytes = model.points_per_packet * POINT_DTYPE.itemsize
+    return model.packets_per_s * (point_bytes + model.packet_bytes + TAPE_BYTES_PER_PACKET)
 
 
-class _Burst:
-    """Things that come in bursts and are told once for each."""
-
-    _last_ns = -BURST_QUIET_NS
-
-    def begins(self, now_ns: int) -> bool:
-        """Whether what happens now is the first of a burst: nothing of it had come for a while."""
-        quiet_ns, self._last_ns = now_ns - self._last_ns, now_ns
-        return quiet_ns >= BURST_QUIET_NS
-
-
-def _buffer_advice(link: UdpPorts, first: Chunk) -> list[DeviceEvent]:
+def _buffer_advice(held_s: float) -> list[DeviceEvent]:
     """A warning when the socket's buffer cannot hold a second of data."""
-    is_dual = first.data[8] == DUAL_RETURN
-    needed = M1.packets_per_frame * (2 if is_dual else 1) * 1_000_000 // M1.frame_us * PACKET_SOCKET_BYTES
-    if link.receive_buffer_bytes >= needed:
+    if held_s >= 1.0:
         return []
-    held_s = link.receive_buffer_bytes / needed
     advice = "allow more with: sysctl -w net.core.rmem_max=33554432"
     return [DeviceEvent("warning", f"the receive buffer holds only {held_s:.2f} s of this lidar's data; {advice}")]
 

@@ -118,8 +118,8 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     net = Network()
 
     class SendsWhenBound(UdpLink):
-        def __init__(self, address: str, ports: tuple[int, ...]) -> None:
-            super().__init__(address, ports)
+        def __init__(self, address: str, ports: tuple[int, ...], options: links.UdpOptions | None = None) -> None:
+            super().__init__(address, ports, options)
             net.at_connect()
 
     monkeypatch.setattr(links, "UdpLink", SendsWhenBound)

@@ -1,30 +1,23 @@
-"""M1 decoder against the vendor driver's points and hand-made streams, and the driver over loopback sockets."""
+"""Frames of an M1 from streams as networks deliver them."""
 
-import hashlib
 import json
 import lzma
 import random
-import socket
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from threading import Event
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import links
-from drivers.device import DeviceError
-from drivers.lidar import robosense
-from drivers.lidar.robosense import DRIVER, RobosenseConfig, RobosenseDriver
-from drivers.lidar.robosense_decoder import M1Decoder, PointDecoder, is_measurement
-from drivers.links import UdpLink
-from drivers.samples import POINT_DTYPE, ClockPairs, DeviceEvent, Received, ScanSample
+from drivers.lidar.models import M1, recognise
+from drivers.lidar.points import PointDecoder
+from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
+from drivers.samples import ScanSample
 
 DATA = Path(__file__).parent.parent / "data" / "lidar"
 EXPECTED: dict[str, dict[str, dict[str, int | str]]] = json.loads((DATA / "expected.json").read_text())
@@ -73,29 +66,20 @@ def difop() -> bytes:
     return bytes(body)
 
 
-def feed_all(decoder: M1Decoder, packets: list[bytes], finish: bool = True) -> list[ScanSample]:
+def m1_decoder(**options: Any) -> RobosenseDecoder:
+    return RobosenseDecoder(M1, PointOptions(**options))
+
+
+def feed_all(decoder: RobosenseDecoder, packets: list[bytes], finish: bool = True) -> list[ScanSample]:
     scans = [scan for one in packets for scan in decoder.feed(one)]
     return scans + decoder.finish() if finish else scans
-
-
-@pytest.mark.parametrize(("name", "variant"), [(name, variant) for name in EXPECTED for variant in EXPECTED[name]])
-def test_points_are_those_of_the_vendors_driver(name: str, variant: str) -> None:
-    limits = (1.0, 50.0) if variant == "dense_1_50" else (None, None)
-    packets = [one for one in datagrams(name) if is_measurement(one)]
-    if name in ("m1_loss", "m1_reorder"):  # the others are empty
-        packets = packets[::8]
-    decoder = M1Decoder(*limits)
-    points = decoder.decode_packets(packet_array(packets), keep_invalid=variant == "nan")
-    assert points.dtype == POINT_DTYPE
-    assert len(points) == EXPECTED[name][variant]["points"]
-    assert hashlib.sha256(points.tobytes()).hexdigest() == EXPECTED[name][variant]["sha256"]
 
 
 def test_worked_example_of_the_manual() -> None:
     example = bytearray(packet(1, START_US + 7))
     example[32:34] = bytes([30, 0])
     example[34:43] = struct.pack(">HHHBBB", 0x0A77, 0x83A2, 0x94DF, 77, 0, 0)
-    point = M1Decoder().decode_packets(packet_array([bytes(example)]))[0]
+    point = PointDecoder(M1).decode_packets(packet_array([bytes(example)]))[0]
     assert [float(point[axis]) for axis in "xyz"] == pytest.approx([7.876, 10.617, 2.165], abs=6e-4)
     assert (point["intensity"], point["ring"]) == (77, 0)
     assert point["timestamp"] == (START_US + 7) * 1e-6 + 30 * 1e-6
@@ -107,7 +91,7 @@ def test_worked_example_of_the_manual() -> None:
 )
 def test_range_limits_hold_both_ends(limits: tuple[float | None, float | None], kept: list[int]) -> None:
     packets = packet_array([packet(1, START_US, radius=radius) for radius in (0, 40, 41, 400, 40000, 40001)])
-    points = M1Decoder(*limits).decode_packets(packets)
+    points = PointDecoder(M1, *limits).decode_packets(packets)
     assert len(points) == 125 * len(kept)
     assert points["x"][::125] == pytest.approx([radius * 0.005 for radius in kept], rel=1e-4)
 
@@ -115,8 +99,8 @@ def test_range_limits_hold_both_ends(limits: tuple[float | None, float | None], 
 @pytest.mark.parametrize("count", [0, 1, 125, 126, 127, 253])
 def test_any_number_of_packets(count: int) -> None:
     packets = frame(0)[:count]
-    points = M1Decoder().decode_packets(packet_array(packets) if packets else np.empty((0, 1210), np.uint8))
-    single = [M1Decoder().decode_packets(packet_array([one])) for one in packets]
+    points = PointDecoder(M1).decode_packets(packet_array(packets) if packets else np.empty((0, 1210), np.uint8))
+    single = [PointDecoder(M1).decode_packets(packet_array([one])) for one in packets]
     assert points.tobytes() == b"".join(one.tobytes() for one in single)
 
 
@@ -133,20 +117,20 @@ FRAMES = {
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_frames_where_the_network_is_not_right(name: str) -> None:
-    decoder = M1Decoder(keep_invalid=True)
+    decoder = m1_decoder(keep_invalid=True)
     packets = datagrams(name)
     scans = feed_all(decoder, packets)
     assert [(s.packets_received, s.packets_expected, s.duplicates, s.is_partial) for s in scans] == FRAMES[name]
     assert decoder.lost_packets == sum(s.packets_expected - s.packets_received for s in scans if not s.is_partial)
     # Each packet's points once, in order of the packets' times.
-    unique = sorted({one for one in packets if is_measurement(one)}, key=lambda one: one[10:20])
+    unique = sorted({one for one in packets if recognise(one) is M1}, key=lambda one: one[10:20])
     points = np.concatenate([scan.points for scan in scans])
-    assert points.tobytes() == PointDecoder(decoder.model).decode_packets(packet_array(unique), True).tobytes()
+    assert points.tobytes() == PointDecoder(M1).decode_packets(packet_array(unique), True).tobytes()
     assert all(first.last_ticks < second.first_ticks for first, second in pairwise(scans))
 
 
 def test_junk_is_counted_and_difop_kept() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     packets = datagrams("m1_midstart_junk")
     feed_all(decoder, packets)
     assert (decoder.bad_frames, decoder.skipped_bytes) == (4, 102 + 1210 + 1210 + 200)
@@ -156,7 +140,7 @@ def test_junk_is_counted_and_difop_kept() -> None:
 
 @pytest.mark.parametrize(("mode", "count"), [(4, 630), (0, 1260)])
 def test_a_whole_frame_is_written_with_its_last_packet(mode: int, count: int) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     first, second = frame(0, count, mode), frame(1, count, mode)
     assert feed_all(decoder, first + second[:19], finish=False) == []
     (scan,) = decoder.feed(second[19])  # the first frame teaches the cadence; the next packets tell that it is over
@@ -169,26 +153,26 @@ def test_a_whole_frame_is_written_with_its_last_packet(mode: int, count: int) ->
 
 
 def test_number_of_packets_is_known_although_each_frame_lost_its_last() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, [one for index in range(4) for one in frame(index)[:-1]])
     assert [scan.packets_expected for scan in scans] == [630] * 4
     assert decoder.lost_packets == 3  # what the last frame lacks at its end may never have been sent
 
 
 def test_another_number_of_packets_is_followed_after_ten_frames() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, [one for index in range(12) for one in frame(index, 600)])
     assert [scan.packets_expected for scan in scans] == [630] * 9 + [600] * 3
 
 
 def test_given_number_of_packets_overrides() -> None:
-    decoder = M1Decoder(packets_per_frame=12)
+    decoder = m1_decoder(packets_per_frame=12)
     scans = feed_all(decoder, frame(0, 12), finish=False)
     assert [scan.packets_expected for scan in scans] == [12]
 
 
 def test_whole_frames_lost_are_counted() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, frame(0) + frame(1) + frame(7)[100:] + frame(8))
     assert [scan.packets_received for scan in scans] == [630, 630, 530, 630]
     assert not any(scan.is_partial for scan in scans)
@@ -197,7 +181,7 @@ def test_whole_frames_lost_are_counted() -> None:
 
 @pytest.mark.parametrize("jump_us", [37_000_000_000, -37_000_000, 130_000, -2_500_000])
 def test_a_jump_of_the_clock_starts_over(jump_us: int) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     moved = frame(2, start_us=START_US + jump_us)
     scans = feed_all(decoder, frame(0) + frame(1)[:300] + moved[300:] + frame(3, start_us=START_US + jump_us))
     assert decoder.restarts == 1
@@ -207,7 +191,7 @@ def test_a_jump_of_the_clock_starts_over(jump_us: int) -> None:
 
 
 def test_one_packet_with_a_wrong_time_is_only_bad() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     packets = [one for index in range(3) for one in frame(index)]
     for place, time_us in ((100, 0), (800, START_US + 10**9), (1300, START_US + 5_000_000), (1500, 8 * 10**15)):
         packets.insert(place, packet(5, time_us))
@@ -218,13 +202,13 @@ def test_one_packet_with_a_wrong_time_is_only_bad() -> None:
 
 @pytest.mark.parametrize("bad", [packet(0, START_US), packet(1261, START_US), packet(1, (1 << 33) * 1_000_000)])
 def test_impossible_number_or_time_is_refused(bad: bytes) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     assert feed_all(decoder, [bad]) == []
     assert (decoder.bad_frames, decoder.skipped_bytes) == (1, 1210)
 
 
 def test_packets_after_their_frame_was_written() -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     frames = [frame(index) for index in range(3)]
     missing = frames[1].pop(9)
     feed_all(decoder, frames[0] + frames[1] + frames[2][:100] + [missing, missing, frames[2][5]] + frames[2][100:])
@@ -254,7 +238,7 @@ def disturbed(seed: int, begin: int, loss: float, delay: int) -> list[tuple[int,
 @settings(deadline=None)
 def test_membership_is_exact_whatever_the_network_does(seed: int, begin: int, loss: float, delay: int) -> None:
     arrived = disturbed(seed, begin, loss, delay)
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = feed_all(decoder, [one for _, one in arrived])
     want = Counter(index for index, _ in dict.fromkeys(arrived))
     got = {(scan.first_ticks - START_US) // 100_000: scan for scan in scans}
@@ -271,7 +255,7 @@ def test_membership_is_exact_whatever_the_network_does(seed: int, begin: int, lo
 
 @given(st.lists(st.binary(max_size=1300), max_size=20))
 def test_any_bytes(packets: list[bytes]) -> None:
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     assert feed_all(decoder, packets) == []
     assert decoder.bad_frames == len(packets)
     assert decoder.skipped_bytes == sum(map(len, packets))
@@ -288,247 +272,13 @@ HOSTILE_US = st.one_of(
 @settings(deadline=None)
 def test_any_numbers_and_times(headers: list[tuple[int, int, int]]) -> None:
     """Nothing breaks or grows, and each packet is accounted for."""
-    decoder = M1Decoder()
+    decoder = m1_decoder()
     scans = []
+    frames = decoder._slots
+    assert frames is not None
     for header in headers:
         scans += decoder.feed(packet(*header))
-        assert sum(scan is not None for scan in (decoder._older, decoder._newest, decoder._stray)) <= 3
+        assert sum(scan is not None for scan in (frames._older, frames._newest, frames._stray)) <= 3
     scans += decoder.finish()
     in_scans = sum(scan.packets_received for scan in scans)
     assert in_scans + decoder.duplicates + decoder.late + decoder.bad_frames == len(headers)
-
-
-# -- the driver --
-
-
-def free_ports() -> tuple[int, int]:
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
-    ):
-        one.bind((LIDAR, 0))
-        two.bind((LIDAR, 0))
-        return one.getsockname()[1], two.getsockname()[1]
-
-
-class Network:
-    """Sends from the lidar's address or a stranger's; `at_connect` goes out as soon as the ports are bound."""
-
-    def __init__(self) -> None:
-        self.msop_port, self.difop_port = free_ports()
-        self.at_connect: Callable[[], None] = lambda: None
-
-    def send(self, *packets: bytes, source: str = LIDAR, to_difop: bool = False) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.bind((source, 0))
-            for one in packets:
-                sender.sendto(one, (LIDAR, self.difop_port if to_difop else self.msop_port))
-
-    def driver(self, **keys: object) -> RobosenseDriver:
-        entry = {"driver": "robosense", "address": LIDAR, "msop_port": self.msop_port, "difop_port": self.difop_port}
-        config = msgspec.convert(entry | keys, RobosenseConfig)
-        driver = DRIVER.create("lidar", config)
-        assert isinstance(driver, RobosenseDriver)
-        return driver
-
-
-@pytest.fixture
-def network(monkeypatch: pytest.MonkeyPatch) -> Network:
-    net = Network()
-
-    class SendsWhenBound(UdpLink):
-        def __init__(self, address: str, ports: tuple[int, ...]) -> None:
-            super().__init__(address, ports)
-            net.at_connect()
-
-    monkeypatch.setattr(links, "UdpLink", SendsWhenBound)
-    monkeypatch.setattr(robosense, "FIRST_PACKET_S", 0.1)
-    monkeypatch.setattr(robosense, "DIFOP_PERIOD_S", 0.1)
-    return net
-
-
-def collect(reading: Iterator[Received], until: Callable[[list[Received]], bool]) -> list[Received]:
-    items: list[Received] = []
-    while not until(items):
-        items.append(next(reading))
-    return items
-
-
-def scans_of(items: list[Received]) -> list[ScanSample]:
-    return [sample for item in items for _, sample in item.samples if isinstance(sample, ScanSample)]
-
-
-def events_of(items: list[Received], kind: str) -> list[DeviceEvent]:
-    return [event for item in items for event in item.events if event.kind == kind]
-
-
-def chunk_count(items: list[Received]) -> int:
-    return sum(len(item.chunks) for item in items)
-
-
-def test_take_from_first_datagram_to_last_frame(network: Network) -> None:
-    def begin() -> None:
-        network.send(*frame(0, 40))
-        network.send(difop(), to_difop=True)
-
-    network.at_connect = begin
-    driver = network.driver()
-    assert driver.identity == {}
-    driver.connect()
-    assert driver.identity == {
-        "model": "RoboSense M1",
-        "address": LIDAR,
-        "serial": "a1b2c3d4e5f6",
-        "mac": "40:2c:76:08:09:10",
-        "firmware_pl": "0102030405",
-        "firmware_ps": "0607080900",
-    }
-    stop = Event()
-    reading = driver.read(stop)
-    network.send(*frame(1, 40), *frame(2, 40)[:30])
-    items = collect(reading, lambda items: chunk_count(items) == 111)
-    stop.set()
-    items += list(reading)
-    driver.close()
-    assert [scan.packets_received for scan in scans_of(items)] == [40, 40, 30]
-    assert events_of(items, "gap") == events_of(items, "drop") == []
-    chunks = [chunk for item in items for chunk in item.chunks]
-    assert chunks[0].destination == (LIDAR, network.msop_port)
-    for item in items:
-        kinds = [type(sample) for _, sample in item.samples]
-        assert ClockPairs not in kinds[1:]  # pairs come before the frames they place in time
-    pairs = [sample for item in items for _, sample in item.samples if isinstance(sample, ClockPairs)]
-    assert np.concatenate([pair.ticks for pair in pairs])[[0, 40, 80]].tolist() == [
-        START_US,
-        START_US + 100_000,
-        START_US + 200_000,
-    ]
-    arrivals = {chunk.arrival_ns for chunk in chunks}
-    assert all(arrival_ns in arrivals for item in items for arrival_ns, _ in item.samples)
-    assert {int(value) for pair in pairs for value in pair.arrival_ns} <= arrivals
-
-
-def test_options_reach_the_decoder(network: Network) -> None:
-    network.at_connect = lambda: network.send(packet(1, START_US, radius=0), packet(2, START_US + 159, radius=2000))
-    driver = network.driver(keep_invalid=True, max_range_m=5.0)
-    driver.connect()
-    stop = Event()
-    reading = driver.read(stop)
-    collect(reading, lambda items: chunk_count(items) == 2)
-    stop.set()
-    (scan,) = scans_of(list(reading))
-    driver.close()
-    assert len(scan.points) == 250
-    assert np.isnan(scan.points["x"]).all()
-
-
-def test_lost_packets_bad_packets_strangers(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    network.at_connect = lambda: network.send(*frame(0, 40))
-    driver = network.driver()
-    driver.connect()
-    stop = Event()
-    reading = driver.read(stop)
-    network.send(b"junk", b"more junk")
-    network.send(*frame(1, 40), source=STRANGER)
-    network.send(*frame(1, 40)[:10], *frame(1, 40)[15:], *frame(2, 40))
-    items = collect(reading, lambda items: chunk_count(items) == 117)
-    items += collect(reading, lambda items: bool(events_of(items, "garbage")))
-    stop.set()
-    items += list(reading)
-    driver.close()
-    assert [scan.packets_received for scan in scans_of(items)] == [40, 35, 40]
-    assert [event.count for event in events_of(items, "gap")] == [5]
-    assert [event.count for event in events_of(items, "garbage")] == [2]
-    (foreign,) = [event for event in events_of(items, "warning") if "other addresses" in event.text]
-    assert foreign.count == 40
-
-
-def test_kernel_drops_and_gaps_add_up(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(links, "RECEIVE_BUFFER_BYTES", 65536)
-    network.at_connect = lambda: network.send(*frame(0, 40)[:10])
-    driver = network.driver()
-    driver.connect()
-    stop = Event()
-    reading = driver.read(stop)
-    items = [next(reading)]
-    (advice,) = [event for event in items[0].events if event.kind == "warning"]
-    assert "net.core.rmem_max" in advice.text
-    items += collect(reading, lambda items: chunk_count(items) == 10)
-    network.send(*frame(0, 40)[10:], *frame(1, 40), *frame(2, 40)[:5], *frame(2, 40)[7:])  # far more than fit in
-    items += collect(reading, lambda items: chunk_count(items) > 0)  # one read takes all there is
-    rest = frame(3, 40) + frame(4, 40)[:25]
-    for at in range(0, 65, 13):  # with them the kernel tells what it dropped
-        network.send(*rest[at : at + 13])
-        items += collect(reading, lambda items: chunk_count(items) == 13)
-    stop.set()
-    items += list(reading)
-    driver.close()
-    dropped = sum(event.count for event in events_of(items, "drop"))
-    lost = sum(event.count for event in events_of(items, "gap"))
-    assert dropped > 40
-    assert dropped + lost + sum(scan.packets_received for scan in scans_of(items)) == 4 * 40 + 25
-
-
-def test_two_lidars_on_one_port_are_told_once(network: Network) -> None:
-    network.at_connect = lambda: network.send(*frame(0, 40))
-    driver = network.driver()
-    driver.connect()
-    stop = Event()
-    reading = driver.read(stop)
-    one, other = frame(1, 40), frame(1, 40, start_us=START_US + 7_777_777)
-    network.send(*[sent for at in range(0, 40, 2) for sent in one[at : at + 2] + other[at : at + 2]])
-    items = collect(reading, lambda items: chunk_count(items) == 120)
-    stop.set()
-    items += list(reading)
-    driver.close()
-    assert len([event for event in events_of(items, "warning") if "two lidars" in event.text]) == 1
-
-
-def test_nobody_there(network: Network) -> None:
-    network.at_connect = lambda: network.send(*frame(0, 40)[:7], source=STRANGER)
-    with pytest.raises(DeviceError, match=rf"no packet from {LIDAR} on UDP port {network.msop_port}.* 7 datagrams"):
-        network.driver().connect()
-
-
-def test_lidar_that_sends_elsewhere_says_where(network: Network) -> None:
-    network.at_connect = lambda: network.send(difop(), to_difop=True)
-    with pytest.raises(DeviceError, match=r"sends to 192\.168\.1\.102 port 6699"):
-        network.driver().connect()
-
-
-def test_another_model_is_not_taken_for_an_m1(network: Network) -> None:
-    network.at_connect = lambda: network.send(bytes(1248))
-    with pytest.raises(DeviceError, match=r"1 datagrams came, of 1248 bytes, none is of an M1"):
-        network.driver().connect()
-
-
-def test_silence_gives_the_last_frame_then_the_error(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robosense, "SILENCE_S", 0.15)
-    network.at_connect = lambda: network.send(*frame(0, 40)[:20])
-    driver = network.driver()
-    driver.connect()
-    items = []
-    with pytest.raises(DeviceError, match="no measurement packet"):
-        items.extend(driver.read(Event()))
-    driver.close()
-    network.at_connect = lambda: network.send(*frame(9, 40))
-    driver.connect()  # and it is taken up again
-    driver.close()
-    driver.close()
-
-
-@pytest.mark.parametrize(
-    "keys",
-    [
-        {"address": "lidar.local"},
-        {"msop_port": 0},
-        {"difop_port": 70000},
-        {"msop_port": 7000, "difop_port": 7000},
-        {"min_range_m": 5.0, "max_range_m": 1.0},
-        {"rate_hz": 0},
-        {"colour": "red"},
-    ],
-)
-def test_bad_config(keys: dict[str, object]) -> None:
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert({"driver": "robosense", "address": LIDAR} | keys, RobosenseConfig)

@@ -1,0 +1,288 @@
+"""The RoboSense driver over loopback sockets."""
+
+import json
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+
+import msgspec
+import numpy as np
+import pytest
+
+from drivers import links
+from drivers.device import DeviceError
+from drivers.lidar import robosense
+from drivers.lidar.robosense import DRIVER, RobosenseConfig, RobosenseDriver
+from drivers.links import UdpLink
+from drivers.samples import ClockPairs, DeviceEvent, Received, ScanSample
+
+DATA = Path(__file__).parent.parent / "data" / "lidar"
+EXPECTED: dict[str, dict[str, dict[str, int | str]]] = json.loads((DATA / "expected.json").read_text())
+START_US = 1_700_000_000_000_000
+LIDAR, STRANGER = "127.0.0.1", "127.0.0.2"
+
+
+def packet_array(packets: list[bytes]) -> np.ndarray:
+    return np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), 1210)
+
+
+def packet(sequence: int, time_us: int, mode: int = 4, radius: int = 2000) -> bytes:
+    """One MSOP packet by the manual's table; each point has its packet's sequence number as yaw."""
+    seconds, microseconds = divmod(time_us, 1_000_000)
+    header = bytes.fromhex("55AA5AA5") + struct.pack(">HHBB", sequence, 1, mode, 0)
+    header += seconds.to_bytes(6, "big") + struct.pack(">I", microseconds) + bytes(10) + b"\x10\x69"
+    channel = struct.pack(">HHHBBB", radius, 32768, (32768 + sequence) % 65536, 50, 0, 0)
+    return header + (bytes([0, 0]) + channel * 5) * 25 + bytes(3)
+
+
+def frame(index: int, count: int = 630, mode: int = 4, start_us: int = START_US) -> list[bytes]:
+    return [
+        packet(number + 1, start_us + index * 100_000 + round(number * 100_000 / count), mode)
+        for number in range(count)
+    ]
+
+
+def difop() -> bytes:
+    body = bytearray(256)
+    body[:8] = bytes.fromhex("A5FF005A11115555")
+    body[10:18] = bytes([192, 168, 1, 200, 192, 168, 1, 102])
+    body[18:24] = bytes.fromhex("402C76080910")
+    body[24:28] = struct.pack(">HH", 6699, 7788)
+    body[28:38] = bytes.fromhex("01020304050607080900")
+    body[38:44] = bytes.fromhex("A1B2C3D4E5F6")
+    return bytes(body)
+
+
+def free_ports() -> tuple[int, int]:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
+    ):
+        one.bind((LIDAR, 0))
+        two.bind((LIDAR, 0))
+        return one.getsockname()[1], two.getsockname()[1]
+
+
+class Network:
+    """Sends from the lidar's address or a stranger's; `at_connect` goes out as soon as the ports are bound."""
+
+    def __init__(self) -> None:
+        self.msop_port, self.difop_port = free_ports()
+        self.at_connect: Callable[[], None] = lambda: None
+
+    def send(self, *packets: bytes, source: str = LIDAR, to_difop: bool = False) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.bind((source, 0))
+            for one in packets:
+                sender.sendto(one, (LIDAR, self.difop_port if to_difop else self.msop_port))
+
+    def driver(self, **keys: object) -> RobosenseDriver:
+        entry = {"driver": "robosense", "address": LIDAR, "msop_port": self.msop_port, "difop_port": self.difop_port}
+        config = msgspec.convert(entry | keys, RobosenseConfig)
+        driver = DRIVER.create("lidar", config)
+        assert isinstance(driver, RobosenseDriver)
+        return driver
+
+
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> Network:
+    net = Network()
+
+    class SendsWhenBound(UdpLink):
+        def __init__(self, address: str, ports: tuple[int, ...], options: links.UdpOptions | None = None) -> None:
+            super().__init__(address, ports, options)
+            net.at_connect()
+
+    monkeypatch.setattr(links, "UdpLink", SendsWhenBound)
+    monkeypatch.setattr(robosense, "FIRST_PACKET_S", 0.1)
+    monkeypatch.setattr(robosense, "DIFOP_PERIOD_S", 0.1)
+    return net
+
+
+def collect(reading: Iterator[Received], until: Callable[[list[Received]], bool]) -> list[Received]:
+    items: list[Received] = []
+    while not until(items):
+        items.append(next(reading))
+    return items
+
+
+def scans_of(items: list[Received]) -> list[ScanSample]:
+    return [sample for item in items for _, sample in item.samples if isinstance(sample, ScanSample)]
+
+
+def events_of(items: list[Received], kind: str) -> list[DeviceEvent]:
+    return [event for item in items for event in item.events if event.kind == kind]
+
+
+def chunk_count(items: list[Received]) -> int:
+    return sum(len(item.chunks) for item in items)
+
+
+def test_take_from_first_datagram_to_last_frame(network: Network) -> None:
+    def begin() -> None:
+        network.send(*frame(0, 40))
+        network.send(difop(), to_difop=True)
+
+    network.at_connect = begin
+    driver = network.driver()
+    assert driver.identity == {}
+    driver.connect()
+    assert driver.identity == {
+        "model": "RoboSense M1",
+        "address": LIDAR,
+        "serial": "a1b2c3d4e5f6",
+        "mac": "40:2c:76:08:09:10",
+        "firmware_pl": "0102030405",
+        "firmware_ps": "0607080900",
+    }
+    stop = Event()
+    reading = driver.read(stop)
+    network.send(*frame(1, 40), *frame(2, 40)[:30])
+    items = collect(reading, lambda items: chunk_count(items) == 111)
+    stop.set()
+    items += list(reading)
+    driver.close()
+    assert [scan.packets_received for scan in scans_of(items)] == [40, 40, 30]
+    assert events_of(items, "gap") == events_of(items, "drop") == []
+    chunks = [chunk for item in items for chunk in item.chunks]
+    assert chunks[0].destination == (LIDAR, network.msop_port)
+    for item in items:
+        kinds = [type(sample) for _, sample in item.samples]
+        assert ClockPairs not in kinds[1:]  # pairs come before the frames they place in time
+    pairs = [sample for item in items for _, sample in item.samples if isinstance(sample, ClockPairs)]
+    assert np.concatenate([pair.ticks for pair in pairs])[[0, 40, 80]].tolist() == [
+        START_US,
+        START_US + 100_000,
+        START_US + 200_000,
+    ]
+    arrivals = {chunk.arrival_ns for chunk in chunks}
+    assert all(arrival_ns in arrivals for item in items for arrival_ns, _ in item.samples)
+    assert {int(value) for pair in pairs for value in pair.arrival_ns} <= arrivals
+
+
+def test_options_reach_the_decoder(network: Network) -> None:
+    network.at_connect = lambda: network.send(packet(1, START_US, radius=0), packet(2, START_US + 159, radius=2000))
+    driver = network.driver(keep_invalid=True, max_range_m=5.0)
+    driver.connect()
+    stop = Event()
+    reading = driver.read(stop)
+    collect(reading, lambda items: chunk_count(items) == 2)
+    stop.set()
+    (scan,) = scans_of(list(reading))
+    driver.close()
+    assert len(scan.points) == 250
+    assert np.isnan(scan.points["x"]).all()
+
+
+def test_lost_packets_bad_packets_strangers(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    network.at_connect = lambda: network.send(*frame(0, 40))
+    driver = network.driver()
+    driver.connect()
+    stop = Event()
+    reading = driver.read(stop)
+    network.send(b"junk", b"more junk")
+    network.send(*frame(1, 40), source=STRANGER)
+    network.send(*frame(1, 40)[:10], *frame(1, 40)[15:], *frame(2, 40))
+    items = collect(reading, lambda items: chunk_count(items) == 117)
+    items += collect(reading, lambda items: bool(events_of(items, "garbage")))
+    stop.set()
+    items += list(reading)
+    driver.close()
+    assert [scan.packets_received for scan in scans_of(items)] == [40, 35, 40]
+    assert [event.count for event in events_of(items, "gap")] == [5]
+    assert [event.count for event in events_of(items, "garbage")] == [2]
+    (foreign,) = [event for event in events_of(items, "warning") if "other addresses" in event.text]
+    assert foreign.count == 40
+
+
+def test_kernel_drops_and_gaps_add_up(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(links, "RECEIVE_BUFFER_BYTES", 65536)
+    network.at_connect = lambda: network.send(*frame(0, 40)[:10])
+    driver = network.driver()
+    driver.connect()
+    stop = Event()
+    reading = driver.read(stop)
+    items = [next(reading)]
+    (advice,) = [event for event in items[0].events if event.kind == "warning"]
+    assert "net.core.rmem_max" in advice.text
+    items += collect(reading, lambda items: chunk_count(items) == 10)
+    network.send(*frame(0, 40)[10:], *frame(1, 40), *frame(2, 40)[:5], *frame(2, 40)[7:])  # far more than fit in
+    items += collect(reading, lambda items: chunk_count(items) > 0)  # one read takes all there is
+    rest = frame(3, 40) + frame(4, 40)[:25]
+    for at in range(0, 65, 13):  # with them the kernel tells what it dropped
+        network.send(*rest[at : at + 13])
+        items += collect(reading, lambda items: chunk_count(items) == 13)
+    stop.set()
+    items += list(reading)
+    driver.close()
+    dropped = sum(event.count for event in events_of(items, "drop"))
+    lost = sum(event.count for event in events_of(items, "gap"))
+    assert dropped > 40
+    assert dropped + lost + sum(scan.packets_received for scan in scans_of(items)) == 4 * 40 + 25
+
+
+def test_two_lidars_on_one_port_are_told_once(network: Network) -> None:
+    network.at_connect = lambda: network.send(*frame(0, 40))
+    driver = network.driver()
+    driver.connect()
+    stop = Event()
+    reading = driver.read(stop)
+    one, other = frame(1, 40), frame(1, 40, start_us=START_US + 7_777_777)
+    network.send(*[sent for at in range(0, 40, 2) for sent in one[at : at + 2] + other[at : at + 2]])
+    items = collect(reading, lambda items: chunk_count(items) == 120)
+    stop.set()
+    items += list(reading)
+    driver.close()
+    assert len([event for event in events_of(items, "warning") if "two lidars" in event.text]) == 1
+
+
+def test_nobody_there(network: Network) -> None:
+    network.at_connect = lambda: network.send(*frame(0, 40)[:7], source=STRANGER)
+    with pytest.raises(DeviceError, match=rf"no packet from {LIDAR} on UDP port {network.msop_port}.* 7 datagrams"):
+        network.driver().connect()
+
+
+def test_lidar_that_sends_elsewhere_says_where(network: Network) -> None:
+    network.at_connect = lambda: network.send(difop(), to_difop=True)
+    with pytest.raises(DeviceError, match=r"sends to 192\.168\.1\.102 port 6699"):
+        network.driver().connect()
+
+
+def test_another_model_is_not_taken_for_an_m1(network: Network) -> None:
+    network.at_connect = lambda: network.send(bytes(1248))
+    with pytest.raises(DeviceError, match=r"1 datagrams came, of 1248 bytes, none is of a known model"):
+        network.driver().connect()
+
+
+def test_silence_gives_the_last_frame_then_the_error(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robosense, "SILENCE_S", 0.15)
+    network.at_connect = lambda: network.send(*frame(0, 40)[:20])
+    driver = network.driver()
+    driver.connect()
+    items = []
+    with pytest.raises(DeviceError, match="no measurement packet"):
+        items.extend(driver.read(Event()))
+    driver.close()
+    network.at_connect = lambda: network.send(*frame(9, 40))
+    driver.connect()  # and it is taken up again
+    driver.close()
+    driver.close()
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"address": "lidar.local"},
+        {"msop_port": 0},
+        {"difop_port": 70000},
+        {"msop_port": 7000, "difop_port": 7000},
+        {"min_range_m": 5.0, "max_range_m": 1.0},
+        {"rate_hz": 0},
+        {"colour": "red"},
+    ],
+)
+def test_bad_config(keys: dict[str, object]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"driver": "robosense", "address": LIDAR} | keys, RobosenseConfig)
