@@ -104,6 +104,7 @@ def send(msop_port: int, difop_port: int, multiple: float, duration_s: float) ->
         udp.bind((LIDAR, 0))
         udp.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, M1.packet_bytes)
         print("ready", flush=True)
+        time.sleep(0.5)  # until the receiver has bound its ports
         begin_s = time.monotonic()
         sent = 0
         for frame in range(round(duration_s * rate_hz)):
