@@ -216,7 +216,7 @@ class Cast:
         self.cameras: list[PinholeCamera] = []
         self.ports = UdpPorts()
         self._faults = settings.faults
-        self._lidars = settings.lidars
+        self.lidars = settings.lidars
         self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
             **dict.fromkeys(IMUS, self._imu),
             "nmea": self._nmea,
@@ -263,7 +263,7 @@ class Cast:
             raise ValueError(f"devices.{name}.imu_port: only a simulated airy sends its IMU's readings apart")
         settings = self._with_ports(name, settings, ports)
         faults = self.faults(name, is_serial=False)
-        setup = self._lidars.get(name, LidarSettings())
+        setup = self.lidars.get(name, LidarSettings())
         return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room, faults, setup)
 
     def _stream(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:

@@ -37,6 +37,7 @@ IMU_FROM_LIDAR: FloatArray = np.array(
 """(4, 4): the lidar stands upright above the IMU, looking the same way."""
 _HANDLING_NS = 100_000  # from the last firing of a packet to the wire
 _WAKE_NS = MILLISECOND_NS
+AHEAD_FRAMES = 6  # the first ones take longer to build
 
 ModelKey = Literal["m1", "m2", "m3", "e1", "airy", "helios32", "helios16p", "rs16"]
 
@@ -137,7 +138,7 @@ class RobosenseSimulator:
                 self._send(sender, self._ready.get())
 
     def _build(self) -> None:
-        for frame in self._frames(self._grid.clock.device_ns(time.monotonic_ns()) // FRAME_NS + 2):
+        for frame in self._frames(self._grid.clock.device_ns(time.monotonic_ns()) // FRAME_NS + AHEAD_FRAMES):
             self._ready.put(frame)
 
     def _frames(self, index: int) -> Iterator[_Frame]:
