@@ -36,6 +36,7 @@ from simulated_devices.microstrain import MicrostrainSettings, microstrain_simul
 from simulated_devices.nmea import NmeaSettings, NmeaSimulator
 from simulated_devices.pose import PoseSettings, PoseSimulator
 from simulated_devices.robosense import LidarSettings, RobosenseSettings, RobosenseSimulator
+from simulated_devices.robosense_imu import RobosenseImuSettings, RobosenseImuSimulator
 from simulated_devices.scene import PinholeCamera, Room, stereo_pair
 from simulated_devices.timing import SECOND_NS, Opened, Stage, die_with_parent, wake_precisely
 from simulated_devices.vectornav import VectornavSettings, vectornav_simulator
@@ -221,6 +222,7 @@ class Cast:
             **dict.fromkeys(IMUS, self._imu),
             "nmea": self._nmea,
             "robosense": self._robosense,
+            "robosense-imu": self._robosense_imu,
             "stream": self._stream,
             "pose": self._pose,
         }
@@ -258,13 +260,18 @@ class Cast:
 
     def _robosense(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, RobosenseSettings, f"devices.{name}")
-        ports = ("msop_port", "difop_port", "imu_port") if settings.imu_port else ("msop_port", "difop_port")
-        if settings.imu_port and settings.model != "airy":
-            raise ValueError(f"devices.{name}.imu_port: only a simulated airy sends its IMU's readings apart")
-        settings = self._with_ports(name, settings, ports)
+        settings = self._with_ports(name, settings, ("msop_port", "difop_port"))
         faults = self.faults(name, is_serial=False)
         setup = self.lidars.get(name, LidarSettings())
         return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room, faults, setup)
+
+    def _robosense_imu(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = _convert(entry, RobosenseImuSettings, f"devices.{name}")
+        if settings.model == "airy":  # an e1's comes to a port of its lidar
+            settings = self._with_ports(name, settings, ("port",))
+        setup = self.lidars.get(name) or self.lidars.get(settings.clock) or LidarSettings()
+        faults = self.faults(name, is_serial=False)
+        return RobosenseImuSimulator(name, settings, self.stage, self.trajectory, faults, setup)
 
     def _stream(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, CameraSettings, f"devices.{name}")

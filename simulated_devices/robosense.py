@@ -23,14 +23,13 @@ from simulated_devices.lidar_scan import World
 from simulated_devices.links import DatagramSender
 from simulated_devices.robosense_mems import E1, M2, M3, M1Lidar, VectorLidar
 from simulated_devices.robosense_packets import FRAME_NS, HOST, Clock, Identity, Lidar, Mode, Motion
-from simulated_devices.robosense_spinning import AIRY_IMU_RATE_HZ, SpinningLidar, airy_imu
+from simulated_devices.robosense_spinning import SpinningLidar
 from simulated_devices.sampling import SampleGrid
 from simulated_devices.scene import Room
 from simulated_devices.timing import MILLISECOND_NS, SECOND_NS, DelayModel, DeviceClock, Int64Array, Pacer, Stage
 from simulated_devices.world import FloatArray, ImuNoise, NoisyImu, Trajectory
 
 TAI_MINUS_UTC_NS = 37 * SECOND_NS
-IMU_PERIOD_NS = SECOND_NS // AIRY_IMU_RATE_HZ
 IMU_FROM_LIDAR: FloatArray = np.array(
     [[1.0, 0.0, 0.0, 0.05], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.08], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -43,13 +42,12 @@ ModelKey = Literal["m1", "m2", "m3", "e1", "airy", "helios32", "helios16p", "rs1
 
 
 class RobosenseSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Keys of the device that the simulation honours. imu_port: where an Airy sends its IMU's packets, 0: nowhere."""
+    """Keys of the device that the simulation honours."""
 
     clock: str = ""
     model: ModelKey = "m1"
     msop_port: int = 6699
     difop_port: int = 7788
-    imu_port: int = 0
 
 
 class LidarSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -96,32 +94,28 @@ class RobosenseSimulator:
             settings.model, World(room, trajectory, IMU_FROM_LIDAR, stage.seed_for("lidar", name)), mode
         )
         self._sender = DatagramSender(name, stage, faults)
-        keeps_time = setup.time != "free"
-        clock = (
-            _utc_clock(name, stage, setup.time)
-            if keeps_time
-            else wrapping_clock(name, settings.clock, stage, faults, None)
-        )
+        clock = lidar_clock(name, settings.clock, stage, faults, setup)
         power_cut = self._sender.schedule.power_cut
-        self._grid = SampleGrid(clock, FRAME_NS, power_cut, keeps_time=keeps_time)
+        self._grid = SampleGrid(clock, FRAME_NS, power_cut, keeps_time=setup.time != "free")
         floor_ns = self.lidar.packet_ns + _HANDLING_NS
         self.delay = DelayModel(floor_ns, jitter_scale_ns=50_000, burst_probability=0.0002, burst_ns=5 * MILLISECOND_NS)
         self._delay = stage.delay(name, self.delay)
         serial_number = stage.seed_for("serial number", name).to_bytes(6)
         self._identity = Identity(serial_number, settings.msop_port, settings.difop_port, mode)
-        self._imu = NoisyImu(trajectory, ImuNoise(), AIRY_IMU_RATE_HZ, stage.seed_for("imu", name))
+        self._imu = NoisyImu(
+            trajectory, ImuNoise(), SECOND_NS / self.lidar.difop_period_ns, stage.seed_for("imu", name)
+        )
         self._ready: queue.Queue[_Frame] = queue.Queue(maxsize=1)
-        self._next_difop_ns = self._next_imu_ns = self._imu_count = 0
+        self._next_difop_ns = 0
 
     def open(self, folder: Path) -> dict[str, object]:
         """Give the keys a recorder needs."""
-        keys: dict[str, object] = {
+        return {
             "address": HOST,
             "msop_port": self._settings.msop_port,
             "difop_port": self._settings.difop_port,
             "latency_s": round(self.delay.floor_ns * 1e-9, 6),
         }
-        return keys | ({"imu_port": self._settings.imu_port} if self._settings.imu_port else {})
 
     def close(self) -> None:
         """Nothing is held."""
@@ -166,20 +160,12 @@ class RobosenseSimulator:
                 sent += 1
             if now_ns >= self._next_difop_ns:
                 self._send_difop(sender, now_ns)
-            if self._settings.imu_port and now_ns >= self._next_imu_ns:
-                self._send_imu(sender, now_ns)
 
     def _send_difop(self, sender: DatagramSender, now_ns: int) -> None:
         time_us = self._grid.clock.device_ns(now_ns) // 1000
         packet = self.lidar.difop(time_us, self._identity, self._motion(now_ns))
         sender.sendto(packet, (HOST, self._settings.difop_port))
         self._next_difop_ns = now_ns + self.lidar.difop_period_ns
-
-    def _send_imu(self, sender: DatagramSender, now_ns: int) -> None:
-        time_us = self._grid.clock.device_ns(now_ns) // 1000
-        sender.sendto(airy_imu(time_us, self._motion(now_ns), self._imu_count), (HOST, self._settings.imu_port))
-        self._imu_count += 1
-        self._next_imu_ns = max(self._next_imu_ns, now_ns - IMU_PERIOD_NS) + IMU_PERIOD_NS
 
     def _motion(self, now_ns: int) -> Motion:
         """What its IMU feels now; it is where the rig's is."""
@@ -197,7 +183,12 @@ def make_lidar(model: ModelKey, world: World, mode: Mode) -> Lidar:
     )
 
 
-def _utc_clock(name: str, stage: Stage, source: Clock) -> DeviceClock:
-    """A clock disciplined to UTC (the host's wall clock), or to TAI: without skew, but with a crystal's slow swing."""
-    start_ns = stage.epoch_utc_ns + (TAI_MINUS_UTC_NS if source == "tai" else 0)
-    return DeviceClock(name, stage.seed, 0.0, epoch_ns=stage.epoch_ns, start_ns=start_ns)
+def lidar_clock(name: str, clock: str, stage: Stage, faults: FaultSettings, setup: LidarSettings) -> DeviceClock:
+    """The clock of a lidar: a crystal of its own, or one disciplined to UTC (the host's wall clock) or TAI.
+
+    A disciplined clock has no skew, but a crystal's slow swing.
+    """
+    if setup.time == "free":
+        return wrapping_clock(name, clock, stage, faults, None)
+    start_ns = stage.epoch_utc_ns + (TAI_MINUS_UTC_NS if setup.time == "tai" else 0)
+    return DeviceClock(clock or name, stage.seed, 0.0, epoch_ns=stage.epoch_ns, start_ns=start_ns)

@@ -249,13 +249,12 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
         ("simulate.lidars.radar={}", ["simulate.lidars.radar", "lidar"]),
         ("simulate.lidars.lidar.time=ntp", ["simulate.lidars", "time", "ntp"]),
         ("devices.lidar.model=m9", ["devices.lidar.model", "m9"]),
-        ("devices.lidar.imu_port=6688", ["devices.lidar.imu_port", "airy"]),
         ("simulate.trajectory=slow", ["simulate.trajectory", "brisk, gentle"]),
         (
             "devices.imu.driver=oak",
             [
                 "devices.imu.driver",
-                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, stream, vectornav, witmotion, xsens",
+                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, robosense-imu, stream, vectornav, witmotion, xsens",
             ],
         ),
         ("devices.imu.rate_hz=300", ["devices.imu.rate_hz", "200, 250, 400"]),

@@ -18,6 +18,7 @@ from simulated_devices.robosense import (
     RobosenseSimulator,
     make_lidar,
 )
+from simulated_devices.robosense_imu import RobosenseImuSettings, RobosenseImuSimulator
 from simulated_devices.robosense_mems import M1, MsopEncoder
 from simulated_devices.robosense_packets import Identity, Mode, Motion
 from simulated_devices.robosense_spinning import airy_imu
@@ -299,6 +300,21 @@ def test_the_imu_of_an_airy():
     assert packet[:14] == bytes.fromhex("AA555A05") + TIME
     assert struct.unpack(">6i", packet[14:38]) == (8192, 0, -8192, 16384, 0, 0)
     assert packet[42:49] == bytes.fromhex("00 01 01 00000007")
+
+
+def test_an_airys_imu_is_on_its_lidars_clock(room):
+    stage, trajectory = Stage(seed=1, jitter=0.0), Trajectory.named("gentle", 1)
+    lidar = RobosenseSimulator("lidar", RobosenseSettings(model="airy"), stage, trajectory, room)
+    imu = RobosenseImuSimulator("imu", RobosenseImuSettings(clock="lidar"), stage, trajectory)
+    begin_ns = stage.epoch_ns + 10**9
+    imu._grid.start(begin_ns)
+    for number, (due_ns, packet) in enumerate(imu.packets(10)):
+        seconds, microseconds = int.from_bytes(packet[4:10]), int.from_bytes(packet[10:14])
+        taken_ns = lidar._grid.clock.host_ns(seconds * 10**9 + microseconds * 1000)
+        assert 0 < taken_ns - begin_ns < 70_000_000
+        assert abs(due_ns - taken_ns - 150_000) < 1_000
+        assert packet[45:49] == number.to_bytes(4)
+        assert struct.unpack(">i", packet[22:26])[0] * 4 / 32768 == pytest.approx(1.0, abs=0.2)  # g, upwards
 
 
 @pytest.mark.parametrize(("time", "offset_s", "sync"), [("ptp", 0, 2), ("gps", 0, 1), ("tai", 37, 2)])
