@@ -254,7 +254,8 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
             "devices.imu.driver=oak",
             [
                 "devices.imu.driver",
-                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, robosense-imu, stream, vectornav, witmotion, xsens",
+                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, robosense-imu, stream, vectornav, "
+                "witmotion, xsens",
             ],
         ),
         ("devices.imu.rate_hz=300", ["devices.imu.rate_hz", "200, 250, 400"]),
