@@ -57,7 +57,7 @@ class Capture(Protocol):
         """Bytes read so far."""
 
     def chunks(self) -> Iterator[Chunk]:
-        """All it holds, in order; arrivals never step back. Nothing is raised, see `fault`."""
+        """All it holds, in its order; arrivals step back by a second at most. Nothing is raised, see `fault`."""
 
     def events(self) -> list[DeviceEvent]:
         """What a user must know of what was read."""
@@ -110,10 +110,9 @@ class PacketCapture:
                 arrival_ns = last_ns or 0
                 if packet.stamp_ns is not None:
                     arrival_ns = packet.stamp_ns + shift_ns
-                if last_ns is not None and arrival_ns < last_ns:
-                    if last_ns - arrival_ns > CLOCK_STEP_NS:
-                        shift_ns += last_ns - arrival_ns
-                        self.clock_steps += 1
+                if last_ns is not None and last_ns - arrival_ns > CLOCK_STEP_NS:
+                    shift_ns += last_ns - arrival_ns
+                    self.clock_steps += 1
                     arrival_ns = last_ns
                 last_ns = arrival_ns
                 if packet.link_type == USER0:

@@ -30,6 +30,7 @@ CLIP = (
     3.0  # delays further above the median than this many spreads count as such; a trimmed mean would follow the polls
 )
 SHRINK = 0.6
+LEAST_DOUBT = 1e-6  # arrivals without any jitter leave none, and a weight must stay finite
 FIRST_WINDOW_S = 20.0  # the window is not cut below this
 
 
@@ -192,7 +193,7 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: flo
         if length > 0:
             height = low_y - slope_hull * low_x
             unsteady = min(4 * float(np.median(height) - height.min()) / spread, 1.0)
-            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-4 * minutes))
+            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-4 * minutes), LEAST_DOUBT)
             sd_hull = 2.5 / (1 + minutes) * doubt * spread / span * (1 + span / (2 * length))
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf

@@ -200,11 +200,12 @@ class _Decoding:
         samples = [(self._arrival_ns(arrival_ns, sample), sample) for arrival_ns, sample in item.samples]
         if samples and self._pipeline is None:
             self._begin(samples[0][0])
-        if self._device_time is None:
-            self._now_ns = self._links.monotonic_ns()
-            self._last_ns = item.chunks[-1].arrival_ns if item.chunks else self._last_ns
+        if self._device_time is not None:
+            self._now_ns = self._last_ns = samples[-1][0] if samples else self._now_ns
+        elif item.chunks:  # a driver may be further: it gives later what came while it connected
+            self._now_ns = self._last_ns = item.chunks[-1].arrival_ns
         elif samples:
-            self._now_ns = self._last_ns = samples[-1][0]
+            self._now_ns = self._links.monotonic_ns()
         for event in item.events:
             self._note(event)
         if self._pipeline is None:

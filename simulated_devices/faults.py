@@ -35,7 +35,8 @@ class FaultSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     Rates are chances: per bit, byte, message or write. `*_at_s` counts from the moment the world starts to move.
 
-    stale_rate: one of the last messages comes once more. text_rate: `text` comes before a message.
+    stale_rate: one of the last messages comes once more. late_rate: a message comes after some of those behind it.
+    text_rate: `text` comes before a message.
     split_rate, glue_rate: a write is torn in two, or comes together with the next one.
     latency_timer_s: bytes wait in the adapter for the ticks of this grid (0.016 for an FTDI as it comes).
     wrong_baud: what the device really speaks at; a reader at another speed gets what a UART makes of it.
@@ -51,6 +52,7 @@ class FaultSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     lost_message_rate: Rate = 0.0
     duplicate_rate: Rate = 0.0
     stale_rate: Rate = 0.0
+    late_rate: Rate = 0.0
     text_rate: Rate = 0.0
     text: str = "\r\nbrown-out: restarting sensors\r\n"
     split_rate: Rate = 0.0
@@ -108,6 +110,10 @@ class MessageFaults:
         self._doubled = Hits(settings.duplicate_rate, random_for(seed, "duplicates", device))
         self._stale = Hits(settings.stale_rate, random_for(seed, "stale", device))
         self._choice = random_for(seed, "which stale", device)
+        self._late = Hits(settings.late_rate, random_for(seed, "late", device))
+        self._lateness = random_for(seed, "how late", device)
+        self._waiting: list[tuple[int, bytes]] = []  # count of the message after which it comes
+        self._count = 0
         self._interrupted = Hits(settings.text_rate, random_for(seed, "text", device))
         self._text = settings.text.encode()
         self._past: deque[bytes] = deque(maxlen=REMEMBERED_MESSAGES)
@@ -122,6 +128,17 @@ class MessageFaults:
         if self._stale.one() and self._past:
             sent.append(self._past[int(self._choice.integers(len(self._past)))])
         self._past.append(message)
+        return self._reordered(sent)
+
+    def _reordered(self, sent: list[bytes]) -> list[bytes]:
+        self._count += 1
+        if self._late.one():
+            after = self._count + int(self._lateness.integers(1, REMEMBERED_MESSAGES))
+            self._waiting += [(after, message) for message in sent]
+            sent = []
+        if self._waiting:
+            sent = sent + [message for after, message in self._waiting if after <= self._count]
+            self._waiting = [entry for entry in self._waiting if entry[0] > self._count]
         return sent
 
 

@@ -51,6 +51,11 @@ class Twin:
             raise ConfigError("devices: a mapping of at least one device is needed")
         self._cast = Cast(simulate_settings(source))
         self._devices = {str(name): self._cast.device(str(name), entry) for name, entry in entries.items()}
+        for name, entry in entries.items():
+            if entry["driver"] == "robosense-imu":
+                raise ConfigError(f"devices.{name}: an ideal twin cannot be written of a lidar's IMU")
+            if entry["driver"] == "robosense" and (entry.get("model", "m1") != "m1" or name in self._cast.lidars):
+                raise ConfigError(f"devices.{name}: of lidars, an ideal twin can only be written of an m1 as it comes")
         self._duration_ns = round(duration_s * SECOND_NS)
         self.entries: dict[str, dict[str, Any]] = entries
         self.cameras = [name for name, entry in entries.items() if entry["driver"] == "stream"]

@@ -35,7 +35,8 @@ from simulated_devices.imu import ImuSimulator
 from simulated_devices.microstrain import MicrostrainSettings, microstrain_simulator
 from simulated_devices.nmea import NmeaSettings, NmeaSimulator
 from simulated_devices.pose import PoseSettings, PoseSimulator
-from simulated_devices.robosense import RobosenseSettings, RobosenseSimulator
+from simulated_devices.robosense import LidarSettings, RobosenseSettings, RobosenseSimulator
+from simulated_devices.robosense_imu import RobosenseImuSettings, RobosenseImuSimulator
 from simulated_devices.scene import PinholeCamera, Room, stereo_pair
 from simulated_devices.timing import SECOND_NS, Opened, Stage, die_with_parent, wake_precisely
 from simulated_devices.vectornav import VectornavSettings, vectornav_simulator
@@ -67,7 +68,7 @@ class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The `simulate` keys of a rig.
 
     jitter: factor on all transport jitter and bursts. skew_ppm: bound of the skew each clock draws.
-    faults: what goes wrong with each device, by its name.
+    faults: what goes wrong with each device, by its name. lidars: how each simulated lidar is set up, by its name.
     """
 
     trajectory: str = "gentle"
@@ -75,6 +76,7 @@ class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
     jitter: float = 1.0
     skew_ppm: float = 50.0
     faults: dict[str, FaultSettings] = {}
+    lidars: dict[str, LidarSettings] = {}
 
 
 class SimulatedDevice(Protocol):
@@ -215,10 +217,12 @@ class Cast:
         self.cameras: list[PinholeCamera] = []
         self.ports = UdpPorts()
         self._faults = settings.faults
+        self.lidars = settings.lidars
         self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
             **dict.fromkeys(IMUS, self._imu),
             "nmea": self._nmea,
             "robosense": self._robosense,
+            "robosense-imu": self._robosense_imu,
             "stream": self._stream,
             "pose": self._pose,
         }
@@ -255,11 +259,19 @@ class Cast:
         return NmeaSimulator(name, settings, self.stage, self.trajectory, self.faults(name, is_serial=True))
 
     def _robosense(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
-        settings = self._with_ports(
-            name, _convert(entry, RobosenseSettings, f"devices.{name}"), ("msop_port", "difop_port")
-        )
+        settings = _convert(entry, RobosenseSettings, f"devices.{name}")
+        settings = self._with_ports(name, settings, ("msop_port", "difop_port"))
         faults = self.faults(name, is_serial=False)
-        return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room, faults)
+        setup = self.lidars.get(name, LidarSettings())
+        return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room, faults, setup)
+
+    def _robosense_imu(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = _convert(entry, RobosenseImuSettings, f"devices.{name}")
+        if settings.model == "airy":  # an e1's comes to a port of its lidar
+            settings = self._with_ports(name, settings, ("port",))
+        setup = self.lidars.get(name) or self.lidars.get(settings.clock) or LidarSettings()
+        faults = self.faults(name, is_serial=False)
+        return RobosenseImuSimulator(name, settings, self.stage, self.trajectory, faults, setup)
 
     def _stream(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, CameraSettings, f"devices.{name}")
@@ -295,9 +307,11 @@ class Simulation:
         if not isinstance(entries, dict) or not entries:
             raise ConfigError("devices: a mapping of at least one device is needed")
         settings = simulate_settings(source)
-        for name in settings.faults:
-            if name not in entries:
-                raise ConfigError(f"simulate.faults.{name}: no such device; there are: {', '.join(map(str, entries))}")
+        for key, names in (("faults", settings.faults), ("lidars", settings.lidars)):
+            for name in names:
+                if name not in entries:
+                    there = ", ".join(map(str, entries))
+                    raise ConfigError(f"simulate.{key}.{name}: no such device; there are: {there}")
         cast = Cast(settings)
         try:
             self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]

@@ -345,7 +345,7 @@ class M1Scanner:
         if frame_index is None:
             frame_index = round(t_frame_start_s / M1_FRAME_S)
         rotation, origin = self._block_poses(trajectory, t_frame_start_s, imu_from_lidar)
-        distance, hit = _cast(room, rotation, origin, self._directions)
+        distance, hit = cast_rays(room, rotation, origin, self._directions)
         shape = (M1_PACKETS, M1_BLOCKS, M1_CHANNELS)
         starts = np.random.default_rng([self._seed, abs(frame_index)]).integers(0, 3 * distance.size, 2)
         noise = self._noise_m[starts[0] : starts[0] + distance.size].reshape(distance.shape)
@@ -370,7 +370,7 @@ class M1Scanner:
         return blocks[:, :9].reshape(-1, 3, 3), blocks[:, 9:]
 
 
-def _cast(
+def cast_rays(
     room: Room,
     rotation: npt.NDArray[np.float32],
     origin: npt.NDArray[np.float32],

@@ -185,12 +185,12 @@ def test_what_is_no_datagram_is_left_out_and_told(tmp_path: Path) -> None:
     assert "snap length" in capture.events()[0].text
 
 
-def test_arrivals_do_not_step_back(tmp_path: Path) -> None:
+def test_arrivals_do_not_step_far_back(tmp_path: Path) -> None:
     frame = FRAMES["Ethernet"][1]
     stamps_s = [100.0, 101.0, 100.9, 102.0, 50.0, 51.0]
     packets = [(round(stamp_s * 1e9), frame) for stamp_s in stamps_s]
     chunks, capture = read(written(tmp_path, pcap("<", 1, 1, packets)))
-    assert [chunk.arrival_ns / 1e9 for chunk in chunks] == [100.0, 101.0, 101.0, 102.0, 102.0, 103.0]
+    assert [chunk.arrival_ns / 1e9 for chunk in chunks] == [100.0, 101.0, 100.9, 102.0, 102.0, 103.0]
     assert "1 steps back" in capture.events()[0].text
 
 
@@ -242,7 +242,8 @@ def test_any_bytes(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
     path = written(tmp_path_factory.getbasetemp(), bytes(content), "any.pcap")
     chunks, _ = read(path)
     assert sum(len(chunk.data) for chunk in chunks) <= len(content)
-    assert [chunk.arrival_ns for chunk in chunks] == sorted(chunk.arrival_ns for chunk in chunks)
+    arrivals_ns = [chunk.arrival_ns for chunk in chunks]
+    assert all(two > one - 1_000_000_001 for one, two in zip(arrivals_ns, arrivals_ns[1:], strict=False))
     survey(path).text()
 
 

@@ -371,3 +371,13 @@ def test_wrong_use_is_said_at_once() -> None:
         ClockMap(0)
     with pytest.raises(ValueError, match="wrap_bits"):
         ClockMap(1e6, -1)
+
+
+@pytest.mark.parametrize("gap_hours", [4, 24, 24 * 3650])
+def test_arrivals_without_jitter_and_long_gaps(gap_hours):
+    clock, elapsed_ns = ClockMap(1e9), 0
+    for _ in range(6):
+        for _ in range(20):
+            assert abs(clock.map(10**18 + elapsed_ns, elapsed_ns) - elapsed_ns) < 1_000
+            elapsed_ns += 10**9
+        elapsed_ns += gap_hours * 3600 * 10**9

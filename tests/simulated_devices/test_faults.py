@@ -118,6 +118,16 @@ def test_a_stale_message_is_one_of_the_last_sixteen():
     assert newest == 399
 
 
+def test_a_late_message_comes_behind_some_of_those_after_it():
+    faults = MessageFaults(FaultSettings(late_rate=0.05), 3, "lidar")
+    sent = [message for number in range(2_000) for message in faults.apply(number.to_bytes(2))]
+    numbers = [int.from_bytes(message) for message in sent]
+    assert len(numbers) == len(set(numbers)) > 1_980  # the last ones may still wait
+    late_by = [max(numbers[: place + 1]) - number for place, number in enumerate(numbers)]
+    assert 60 < sum(late > 0 for late in late_by) < 140
+    assert max(late_by) <= 15
+
+
 def test_the_same_seed_gives_the_same_faults_and_one_kind_leaves_the_others_alone():
     settings = FaultSettings(lost_message_rate=0.1, duplicate_rate=0.1, stale_rate=0.1)
     assert sent(settings) == sent(settings)

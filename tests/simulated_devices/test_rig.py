@@ -244,14 +244,18 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("simulate.colour=1", ["simulate.colour", "allowed: faults, jitter, seed, skew_ppm, trajectory"]),
+        ("simulate.colour=1", ["simulate.colour", "allowed: faults, jitter, lidars, seed, skew_ppm, trajectory"]),
         ("simulate.seed=-1", ["simulate.seed"]),
+        ("simulate.lidars.radar={}", ["simulate.lidars.radar", "lidar"]),
+        ("simulate.lidars.lidar.time=ntp", ["simulate.lidars", "time", "ntp"]),
+        ("devices.lidar.model=m9", ["devices.lidar.model", "m9"]),
         ("simulate.trajectory=slow", ["simulate.trajectory", "brisk, gentle"]),
         (
             "devices.imu.driver=oak",
             [
                 "devices.imu.driver",
-                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, stream, vectornav, witmotion, xsens",
+                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, robosense-imu, stream, vectornav, "
+                "witmotion, xsens",
             ],
         ),
         ("devices.imu.rate_hz=300", ["devices.imu.rate_hz", "200, 250, 400"]),
@@ -273,7 +277,7 @@ def test_wrong_use_is_one_line_and_exit_code_2():
     command = [sys.executable, "-m", "simulated_devices", "--set", "simulate.colour=1"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr == "simulate.colour: unknown key; allowed: faults, jitter, seed, skew_ppm, trajectory\n"
+    assert ended.stderr == "simulate.colour: unknown key; allowed: faults, jitter, lidars, seed, skew_ppm, trajectory\n"
 
 
 def test_settings_change_the_rig():
