@@ -26,24 +26,8 @@ import numpy as np
 import serial
 
 from drivers.device import DeviceError
-from drivers.garbage import CountsBadInput, GarbageWatch
-from drivers.ports import Links, SerialPort, UdpOptions, UdpPorts
-from drivers.samples import Chunk
-from drivers.udp_batches import SLOTS, BatchReceiver
-
-__all__ = [
-    "LIVE",
-    "SILENCE_S",
-    "CountsBadInput",
-    "GarbageWatch",
-    "Links",
-    "LiveLinks",
-    "SerialLink",
-    "SerialPort",
-    "UdpLink",
-    "UdpOptions",
-    "UdpPorts",
-]
+from drivers.ports import find_port
+from drivers.samples import Chunk, DeviceEvent
 
 READ_BYTES = 65536
 DATAGRAM_BYTES = 65535
@@ -61,18 +45,54 @@ _TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
 
 
-class SerialLink:
-    """An exclusively opened serial port (or pty), read without waiting for more than has come."""
+class ByteLink(Protocol):
+    """A stream of bytes to and from a device.
 
-    def __init__(self, port: str, baud: int) -> None:
-        """Open `port` raw, 8N1. Raises DeviceError when it is absent, taken or not allowed."""
+    byte_time_ns: how long a byte takes on the wire, 0 where bytes do not come one by one. events: what the user must
+    know of the link.
+    """
+
+    byte_time_ns: float
+    events: tuple[DeviceEvent, ...]
+
+    def read(self, timeout_s: float) -> tuple[int, bytes]:
+        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError on hang-up."""
+
+    def discard_input(self) -> None:
+        """Throw away what waits unread. Raises DeviceError."""
+
+    def write(self, data: bytes) -> Chunk:
+        """Send bytes; gives the chunk for the tape. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Close the link."""
+
+
+class SerialLink:
+    """An exclusively opened serial port (or pty), read without waiting for more than has come.
+
+    byte_time_ns: how long a byte takes on the wire, 0 where bytes do not come one by one. events: what the user must
+    know of the port.
+    """
+
+    def __init__(self, port: str, baud: int, *, keep_dtr: bool = False) -> None:
+        """Open `port` raw, 8N1. Raises DeviceError when it is absent, taken or not allowed.
+
+        keep_dtr: leave the line DTR as it is, also at the end; boards that are reset by it then go on running.
+        """
         self.port = port
         try:
-            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True)
+            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True, dsrdtr=keep_dtr, rtscts=False)
         except (OSError, ValueError, OverflowError, termios.error) as error:
             raise DeviceError(f"{port}: cannot open at {baud} baud: {_reason(error)}{_advice(error)}") from error
+        if keep_dtr:
+            self._stay_connected()
         with contextlib.suppress(OSError, ValueError):  # an FTDI adapter holds bytes back for 16 ms otherwise
             self._serial.set_low_latency_mode(True)
+        known = find_port(port)
+        self.byte_time_ns = known.byte_time_ns(baud)
+        texts = (("warning", known.shorten_latency()), ("info", known.advice()))
+        self.events = tuple(DeviceEvent(kind, text) for kind, text in texts if text)  # type: ignore[arg-type]
         # poll, not select: a process with many files has descriptors that select does not take.
         self._readable = select.poll()
         self._readable.register(self._serial.fileno(), select.POLLIN)
@@ -95,6 +115,13 @@ class SerialLink:
         if not data and events[0][1] & (select.POLLHUP | select.POLLERR):
             raise DeviceError(f"{self.port}: device is gone (hang-up)")
         return arrival_ns, data
+
+    def _stay_connected(self) -> None:
+        """Let the last close not drop DTR; without this the next open would be a pulse again."""
+        with contextlib.suppress(OSError, termios.error):
+            attributes = termios.tcgetattr(self._serial.fileno())
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, attributes)
 
     def discard_input(self) -> None:
         """Throw away what waits unread. Raises DeviceError."""
@@ -126,14 +153,14 @@ class SerialLink:
 class UdpLink:
     """UDP ports of one device: datagrams from its address, with the kernel's arrival time.
 
-    address: the device's own address; datagrams from others are counted in `foreign` and not given out. A device on
-    loopback is listened for on loopback only. kernel_drops: what the kernel dropped for want of room, as it reports.
+    address: the device's own (None: that of the first datagram); datagrams from others are counted in `foreign` and not
+    given out. A device on loopback is listened for on loopback only. kernel_drops: what the kernel dropped for want of
+    room, as it reports.
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
-    def __init__(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> None:
-        """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address."""
-        options = options or UdpOptions()
+    def __init__(self, address: str | None, ports: tuple[int, ...]) -> None:
+        """Bind the ports. Raises DeviceError when one is taken or the address is not an IPv4 address."""
         self.address = address
         self.source_port = options.source_port
         self.foreign = 0
@@ -145,13 +172,10 @@ class UdpLink:
         self._readable = select.poll()
         self._realtime_minus_monotonic_ns = _realtime_minus_monotonic_ns()
         try:
-            self._batches: BatchReceiver | None = BatchReceiver()
-        except OSError:
-            self._batches = None
-        member = b""
-        if options.multicast_group:
-            member = _packed_ipv4(options.multicast_group) + _packed_ipv4(options.interface or "0.0.0.0")
-        bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not options.multicast_group else "0.0.0.0"
+            packed = socket.inet_pton(socket.AF_INET, "0.0.0.0" if address is None else address)
+        except OSError as error:
+            raise DeviceError(f"address {address!r}: not an IPv4 address") from error
+        bind_address = "127.0.0.1" if packed[0] == 127 else "0.0.0.0"
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
             udp = self._share(bind_address, port) if options.shared else self._bind(bind_address, port)
@@ -294,18 +318,12 @@ class UdpLink:
                         arrival_ns = stamp_ns
                 elif kind == SO_RXQ_OVFL:
                     self._count_kernel_drops(udp.fileno(), _UINT32.unpack_from(payload)[0])
-            self._accept(udp, arrival_ns, bytes(self._buffer[:size]), source, destination, chunks)
-
-    def _deal_out(self, udp: socket.socket, chunk: Chunk, chunks: list[Chunk]) -> None:
-        """Give a datagram to all links that accept it; one that nobody accepts is foreign to the one that read it."""
-        assert chunk.source is not None
-        takers = [link for link in self._shared[udp.fileno()].links if link.accepts(chunk.source)]
-        self.foreign += not takers
-        for link in takers:
-            if link is self:
-                chunks.append(chunk)
-            else:
-                link._given.append(chunk)  # noqa: SLF001
+            if self.address is None:
+                self.address = source[0]
+            if source[0] != self.address:
+                self.foreign += 1
+                continue
+            chunks.append(Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination))
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
         seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket
@@ -388,6 +406,46 @@ class LiveLinks:
 
 
 LIVE: Links = LiveLinks()
+
+
+class CountsBadInput(Protocol):
+    """A decoder: it counts what it could not use."""
+
+    @property
+    def bad_frames(self) -> int:
+        """Candidates for a frame that were none."""
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes outside of frames."""
+
+
+@dataclass(slots=True)
+class GarbageWatch:
+    """Turns a decoder's counters of bad input into one event per burst (ended by a second without any).
+
+    A burst that does not end is told every ten seconds.
+    """
+
+    decoder: CountsBadInput
+    _reported: tuple[int, int] = (0, 0)
+    _seen: tuple[int, int] = (0, 0)
+    _begin_ns: int = 0
+    _last_growth_ns: int = 0
+
+    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
+        """The event of a burst that is over, else nothing."""
+        counters = (self.decoder.bad_frames, self.decoder.skipped_bytes)
+        if counters != self._seen:
+            if self._seen == self._reported:
+                self._begin_ns = now_ns
+            self._seen, self._last_growth_ns = counters, now_ns
+        is_over = now_ns - self._last_growth_ns >= BURST_END_NS or now_ns - self._begin_ns >= BURST_MAX_NS
+        if self._seen == self._reported or not is_over:
+            return ()
+        frames, skipped = (new - old for new, old in zip(self._seen, self._reported, strict=True))
+        self._reported = self._seen
+        return (DeviceEvent("garbage", f"{frames} bad frames, {skipped} bytes skipped", frames or skipped),)
 
 
 def _realtime_minus_monotonic_ns() -> int:

@@ -7,7 +7,7 @@ position from GGA, accuracy from GST, date from RMC or ZDA.
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import accumulate
@@ -19,8 +19,9 @@ MAX_SENTENCE_BYTES = 512  # the standard says 82; high-precision receivers do no
 MAX_UBX_PAYLOAD_BYTES = 4096
 EMITTED_QUALITIES = frozenset((1, 2, 3, 4, 5, 9))  # not: none, dead reckoning, manual, simulator
 QUALITY_OF_RMC_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
-QUALITY_RANK = (4, 5, 9, 3, 2, 1)  # best first
-UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 9: 2.5}
+QUALITY_RANK = (4, 5, 9, 3, 2, 1, 6, 8, 7)  # best first
+QUALITY_OF_GNS_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
+UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 6: 20.0, 9: 2.5}
 """Horizontal error, one sigma, for a dilution of 1, by quality: rough, from what receivers with GST say."""
 VERTICAL_PER_HORIZONTAL = 2.0
 MAX_HDOP = 99.0  # receivers send 99.9 for "unknown"
@@ -38,6 +39,21 @@ _COORDINATE = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
 
 TIME_FIELD = {"GGA": 1, "RMC": 1, "GST": 1, "ZDA": 1, "GNS": 1, "GBS": 1, "GRS": 1, "GLL": 5}
 Source = Literal["gst", "dop", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class FixRules:
+    """Which epochs become fixes, and how their numbers are made.
+
+    qualities: those to take (6 dead reckoning, 7 manual, 8 simulator are not by default). is_ellipsoidal: altitude
+    above the ellipsoid instead of mean sea level, None where the undulation is not sent. uere_m: horizontal error, one
+    sigma, for a dilution of 1, by quality; a quality that is not in it has no accuracy without GST.
+    """
+
+    qualities: frozenset[int] = EMITTED_QUALITIES
+    is_ellipsoidal: bool = False
+    uere_m: Mapping[int, float] = field(default_factory=lambda: UERE_M)
+    vertical_per_horizontal: float = VERTICAL_PER_HORIZONTAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +190,14 @@ class _Position:
     satellites: int | None = None
     hdop: float | None = None
     correction_age_s: float | None = None
+    decimals: int = 0
+
+    @property
+    def ellipsoidal_m(self) -> float | None:
+        """Altitude above the ellipsoid."""
+        if self.altitude_m is None or self.undulation_m is None:
+            return None
+        return self.altitude_m + self.undulation_m
 
     def is_better_than(self, other: "_Position | None") -> bool:
         if other is None:
@@ -195,6 +219,7 @@ class _Epoch:
     gga: _Position | None = None
     is_refused: bool = False
     rmc: _Position | None = None
+    gns: _Position | None = None
     date_ns: int | None = None
     sigmas_m: tuple[float, float | None] | None = None
     seen: dict[str, int] = field(default_factory=dict)
@@ -212,10 +237,13 @@ class NmeaDecoder:
     completes dates and undoes jumps of 1024 weeks. `feed` gives a fix as soon as its epoch is known to be over: at the
     sentence that has ended the epochs before, else at the first of the next epoch. `flush` is for the pause between.
     sentences: how many came. rollovers: by how many times 1024 weeks the receiver's date was off, the last time.
+    decimals: of the minutes of the last position given out.
     """
 
     reference_utc_ns: int
+    rules: FixRules = field(default_factory=FixRules)
     sentences: int = 0
+    decimals: int = 0
     rollovers: int = 0
     scanner: SentenceScanner = field(default_factory=SentenceScanner)
     _epoch: _Epoch | None = None
@@ -260,7 +288,7 @@ class NmeaDecoder:
             self._learn()
             self._epoch = _Epoch(day_ns, sentence.offset)
         if (gather := _GATHER.get(kind)) is not None:
-            gather(self._epoch, sentence.fields)
+            gather(self._epoch, sentence.fields, self.rules)
             if kind != "ZDA":  # it brings a date only, often once a second: it must neither end nor spoil an epoch
                 self._mark(address, fixes)
 
@@ -295,17 +323,18 @@ class NmeaDecoder:
         if epoch is None or epoch.is_over:
             return
         epoch.is_over = True
-        position = epoch.gga or (None if epoch.is_refused else epoch.rmc)
-        if position is None or position.quality not in EMITTED_QUALITIES:
+        position = epoch.gga or (None if epoch.is_refused else epoch.gns or epoch.rmc)
+        if position is None or position.quality not in self.rules.qualities:
             return
         epoch.has_fix = True
-        accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m)
+        self.decimals = position.decimals
+        accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m, self.rules)
         fix = FixSample(
             device_ticks=self._utc_ns(epoch),
             stream_offset=epoch.offset,
             latitude_deg=position.latitude_deg,
             longitude_deg=position.longitude_deg,
-            altitude_m=position.altitude_m,
+            altitude_m=position.ellipsoidal_m if self.rules.is_ellipsoidal else position.altitude_m,
             undulation_m=position.undulation_m,
             accuracy_m=accuracy_m,
             vertical_accuracy_m=vertical_accuracy_m,
@@ -328,11 +357,11 @@ class NmeaDecoder:
         return epoch.day_ns + _rounded(near_ns - epoch.day_ns, DAY_NS) * DAY_NS
 
 
-def _gather_gga(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_gga(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     quality = _integer(fields[6]) if len(fields) >= 12 else None
     if quality is None:  # receivers that leave it empty say with RMC whether the position is good
         return
-    if quality not in EMITTED_QUALITIES:
+    if quality not in rules.qualities:
         epoch.is_refused = True
         return
     latitude_deg, longitude_deg = _coordinates(fields[2:6])
@@ -348,22 +377,49 @@ def _gather_gga(epoch: _Epoch, fields: list[str]) -> None:
         satellites=_integer(fields[7]),
         hdop=_number(fields[8], 0, MAX_HDOP),
         correction_age_s=_number(fields[13], 0, 1e6) if len(fields) > 13 else None,
+        decimals=_decimals(fields[2]),
     )
     if position.is_better_than(epoch.gga):
         epoch.gga = position
 
 
-def _gather_rmc(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_rmc(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) < 10 or fields[2] != "A":  # a void sentence may carry any date
         return
     epoch.date_ns = _date_ns(fields[9][:2], fields[9][2:4], fields[9][4:])
     quality = QUALITY_OF_RMC_MODE.get(fields[12], 0) if len(fields) > 12 else 1
     latitude_deg, longitude_deg = _coordinates(fields[3:7])
     if latitude_deg is not None and longitude_deg is not None:
-        epoch.rmc = _Position(fields[0].startswith("GN"), quality, latitude_deg, longitude_deg)
+        epoch.rmc = _Position(
+            fields[0].startswith("GN"), quality, latitude_deg, longitude_deg, decimals=_decimals(fields[3])
+        )
 
 
-def _gather_gst(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_gns(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
+    """One mode letter for each satellite system; the position is as good as the best of them."""
+    if len(fields) < 11:
+        return
+    qualities = [QUALITY_OF_GNS_MODE[letter] for letter in fields[6] if letter in QUALITY_OF_GNS_MODE]
+    latitude_deg, longitude_deg = _coordinates(fields[2:6])
+    if not qualities or latitude_deg is None or longitude_deg is None:
+        return
+    position = _Position(
+        is_multi_system=fields[0].startswith("GN"),
+        quality=min(qualities, key=QUALITY_RANK.index),
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=_number(fields[9], -2_000, 100_000),
+        undulation_m=_number(fields[10], -200, 200),
+        satellites=_integer(fields[7]),
+        hdop=_number(fields[8], 0, MAX_HDOP),
+        correction_age_s=_number(fields[11], 0, 1e6) if len(fields) > 11 else None,
+        decimals=_decimals(fields[2]),
+    )
+    if position.is_better_than(epoch.gns):
+        epoch.gns = position
+
+
+def _gather_gst(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) < 9:
         return
     latitude_m, longitude_m = _number(fields[6], 0, 1e6), _number(fields[7], 0, 1e6)
@@ -371,13 +427,14 @@ def _gather_gst(epoch: _Epoch, fields: list[str]) -> None:
         epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), _number(fields[8], 0, 1e6))
 
 
-def _gather_zda(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_zda(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) >= 5 and epoch.date_ns is None:
         epoch.date_ns = _date_ns(*fields[2:5])
 
 
-_GATHER: dict[str, Callable[[_Epoch, list[str]], None]] = {
+_GATHER: dict[str, Callable[[_Epoch, list[str], FixRules], None]] = {
     "GGA": _gather_gga,
+    "GNS": _gather_gns,
     "RMC": _gather_rmc,
     "GST": _gather_gst,
     "ZDA": _gather_zda,
@@ -385,14 +442,14 @@ _GATHER: dict[str, Callable[[_Epoch, list[str]], None]] = {
 
 
 def _accuracy(
-    position: _Position, sigmas_m: tuple[float, float | None] | None
+    position: _Position, sigmas_m: tuple[float, float | None] | None, rules: FixRules
 ) -> tuple[float | None, float | None, Source]:
     if sigmas_m is not None:
         return *sigmas_m, "gst"
-    if not position.hdop:
+    if not position.hdop or position.quality not in rules.uere_m:
         return None, None, "none"
-    accuracy_m = position.hdop * UERE_M[position.quality]
-    return accuracy_m, accuracy_m * VERTICAL_PER_HORIZONTAL, "dop"
+    accuracy_m = position.hdop * rules.uere_m[position.quality]
+    return accuracy_m, accuracy_m * rules.vertical_per_horizontal, "dop"
 
 
 def _number(text: str, low: float, high: float) -> float | None:
@@ -400,6 +457,10 @@ def _number(text: str, low: float, high: float) -> float | None:
         return None
     value = float(text)
     return value if low <= value <= high else None
+
+
+def _decimals(text: str) -> int:
+    return len(text.partition(".")[2])
 
 
 def _integer(text: str) -> int | None:

@@ -367,6 +367,9 @@ def test_absent_port_is_named() -> None:
 class ScriptedLink:
     """Reads come from a list of (arrival in milliseconds, bytes)."""
 
+    byte_time_ns = 0.0
+    events = ()
+
     def __init__(self, reads: list[tuple[int, bytes]]) -> None:
         self.reads = iter(reads)
 
@@ -381,7 +384,7 @@ class ScriptedLink:
 def scripted(
     monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], rate_hz: float = 10
 ) -> Iterator[Received]:
-    monkeypatch.setattr(links, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", rate_hz)
     driver.connect()
     assert [(stream.kind, stream.rate_hz) for stream in driver.streams] == [("gnss", rate_hz)]
