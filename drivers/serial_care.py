@@ -406,7 +406,9 @@ class SerialDriver(ABC, Generic[Decoder]):
         while not stop.is_set():
             arrival_ns, data = link.read(READ_S)
             samples = self._stamped(arrival_ns, data)
-            rate.samples += len(samples)
+            rate.samples += sum(
+                isinstance(sample, ImuSample) and sample.accel_m_s2 is not None for _, sample in samples
+            )
             events = care.events(arrival_ns, data)
             if data or events:
                 chunks = (Chunk(arrival_ns, data),) if data else ()

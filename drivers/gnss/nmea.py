@@ -51,6 +51,11 @@ class NmeaConfig(DeviceConfig, frozen=True, kw_only=True):
     uere_m: dict[Annotated[int, Meta(ge=1, le=9)], Annotated[float, Meta(gt=0)]] = field(default_factory=dict)
     vertical_per_horizontal: Annotated[float, Meta(gt=0)] = VERTICAL_PER_HORIZONTAL
 
+    def __post_init__(self) -> None:
+        """Raises ValueError when it is not told where the receiver is, or twice."""
+        if sum(map(bool, (self.port, self.tcp, self.udp))) != 1:
+            raise ValueError("set one of port, tcp and udp")
+
 
 class NmeaDriver:
     """One receiver. Device time is UTC in nanoseconds; a fix arrives with the first byte of its epoch."""
@@ -59,9 +64,7 @@ class NmeaDriver:
     wrap_bits = 0
 
     def __init__(self, name: str, config: NmeaConfig) -> None:
-        """Nothing is opened yet. Raises DeviceError when it is not told where the receiver is, or twice."""
-        if sum(map(bool, (config.port, config.tcp, config.udp))) != 1:
-            raise DeviceError(f"{name}: set one of port, tcp and udp")
+        """Nothing is opened yet."""
         self._config = config
         self._where = f"{config.port} at {config.baud} baud" if config.port else config.tcp or f"UDP {config.udp}"
         self._link: ByteLink | None = None
