@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from drivers.gnss.nmea_decoder import SentenceScanner
+from drivers.imu.ascii_decoder import MAX_LINE_BYTES
 from drivers.imu.mip_decoder import MipDecoder
 from drivers.imu.mtdata2 import XbusFramer
 from drivers.imu.rvc_decoder import FRAME_BYTES as RVC_BYTES
@@ -24,8 +25,9 @@ MIN_LINES = 3
 MIN_COLUMNS = 3
 MAX_DATA_BYTES = 65536
 
+_NUMBER = rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _NUMBER_LINE = re.compile(
-    rb"[A-Za-z#$=:_]{0,12}[ \t]*[+-]?\d*\.?\d+(?:[eE][+-]?\d+)?(?:[,;\t ]+[+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)+(?:\*[0-9A-Fa-f]{2})?"
+    rb"[A-Za-z#$=:_]{0,12}[ \t]*" + _NUMBER + rb"(?:[,;\t ]+" + _NUMBER + rb")+(?:\*[0-9A-Fa-f]{2})?"
 )
 _SEPARATORS = re.compile(rb"[,;\t ]+")
 
@@ -96,7 +98,7 @@ def _nmea(data: bytes) -> Finding | None:
 def _ascii_imu(data: bytes) -> Finding | None:
     """Lines of numbers with one number of columns; the first and the last are cut."""
     lines = [line.strip() for line in data.split(b"\n")[1:-1]]
-    numbers = [line for line in lines if _NUMBER_LINE.fullmatch(line)]
+    numbers = [line for line in lines if len(line) <= MAX_LINE_BYTES and _NUMBER_LINE.fullmatch(line)]
     if len(numbers) < MIN_LINES:
         return None
     ((columns, count),) = Counter(len(_SEPARATORS.split(line)) for line in numbers).most_common(1)

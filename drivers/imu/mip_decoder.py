@@ -173,7 +173,8 @@ class MipDecoder:
             case "gps" if GPS_CORRELATION in came:
                 time_of_week_s, week, _ = _GPS.unpack(came[GPS_CORRELATION])
                 if 0 <= time_of_week_s < WEEK_S:
-                    return int(week) * WEEK_S * NS_PER_S + int(round(time_of_week_s * NS_PER_S))
+                    ticks: int = week * WEEK_S * NS_PER_S + round(time_of_week_s * NS_PER_S)
+                    return ticks
         return None
 
 
