@@ -87,8 +87,9 @@ class AsciiDecoder:
             line = bytes(self._buffer[position : end + 1])
             self._take(self._buffer_offset + position, line, samples)
             position = end + 1
-        if len(self._buffer) - position > MAX_LINE_BYTES:  # the rest of this line will come and be none
-            self.bad_frames += not self._is_cut
+        is_long = len(self._buffer) - position > MAX_LINE_BYTES
+        if is_long or self._is_cut:  # what still comes of this line is none
+            self.bad_frames += is_long and not self._is_cut
             self.skipped_bytes += len(self._buffer) - position
             self._is_cut = True
             position = len(self._buffer)
