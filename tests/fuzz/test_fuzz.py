@@ -8,6 +8,7 @@ By hand and guided by coverage, for as long as wanted (needs atheris):
 Without atheris, and in the tests, hypothesis makes the bytes out of pieces of the corpus.
 """
 
+import runpy
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -171,10 +172,14 @@ def main(name: str, arguments: list[str]) -> None:
 
     found = CORPUS.parent / "found" / name
     found.mkdir(parents=True, exist_ok=True)
-    atheris.instrument_all()
+    for module in [module for module in sys.modules if module.partition(".")[0] == "drivers"]:
+        del sys.modules[module]
+    with atheris.instrument_imports(include=["drivers"]):
+        instrumented = runpy.run_path(__file__)
+    target = instrumented["TARGETS"][name]
     atheris.Setup(
         [sys.argv[0], f"-artifact_prefix={found}/", "-max_len=4096", *arguments, str(found), str(CORPUS / name)],
-        lambda data: check(TARGETS[name], data),
+        lambda data: instrumented["check"](target, data),
     )
     atheris.Fuzz()
 
