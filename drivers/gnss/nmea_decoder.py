@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import accumulate
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from drivers.samples import FixSample
 
@@ -33,11 +33,13 @@ ROLLOVER_NS = 1024 * 7 * DAY_NS
 _START = re.compile(rb"[$!\xb5\xd3]")
 _BODY = re.compile(rb"[\x20-\x23\x25-\x29\x2b-\x7e]*")  # printable, neither $ nor *
 _CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
+_WHOLE = re.compile(rb"[\r\n]*(\$)([\x20-\x23\x25-\x29\x2b-\x7e]{0,%d})\*([0-9A-Fa-f]{2})" % (MAX_SENTENCE_BYTES - 2))
+_FOLDS = tuple(1 << bits for bits in range(11, 2, -1))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
 _COORDINATE = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
 
-TIME_FIELD = {"GGA": 1, "RMC": 1, "GST": 1, "ZDA": 1, "GNS": 1, "GBS": 1, "GRS": 1, "GLL": 5}
+TIME_FIELD = {b"GGA": 1, b"RMC": 1, b"GST": 1, b"ZDA": 1, b"GNS": 1, b"GBS": 1, b"GRS": 1, b"GLL": 5}
 Source = Literal["gst", "dop", "none"]
 
 
@@ -56,12 +58,16 @@ class FixRules:
     vertical_per_horizontal: float = VERTICAL_PER_HORIZONTAL
 
 
-@dataclass(frozen=True, slots=True)
-class Sentence:
-    """A sentence with a good checksum; offset: of its first byte in the stream. fields[0] is the address (GPGGA)."""
+class Sentence(NamedTuple):
+    """A sentence with a good checksum; offset: of its first byte in the stream. body: between $ and *."""
 
     offset: int
-    fields: list[str]
+    body: bytes
+
+    @property
+    def fields(self) -> list[str]:
+        """The first is the address (GPGGA)."""
+        return self.body.decode("ascii").split(",")
 
 
 @dataclass(slots=True)
@@ -81,7 +87,17 @@ class SentenceScanner:
         self._buffer += data
         sentences: list[Sentence] = []
         position = 0
-        while match := _START.search(self._buffer, position):
+        while True:
+            whole = _WHOLE.match(self._buffer, position)
+            if whole is not None and _xor(whole[2]) == int(whole[3], 16):
+                sentences.append(Sentence(self._buffer_offset + whole.start(1), whole[2]))
+                position = whole.end()
+                continue
+            match = _START.search(self._buffer, position)
+            if match is None:
+                self._skip(position, len(self._buffer))
+                position = len(self._buffer)
+                break
             self._skip(position, match.start())
             position = match.start()
             length = self._length(position)
@@ -92,17 +108,16 @@ class SentenceScanner:
                 position += 1
                 continue
             if self._buffer[position] == ord("$"):
-                body = self._buffer[position + 1 : position + length - 3]
-                sentences.append(Sentence(self._buffer_offset + position, body.decode("ascii").split(",")))
+                body = bytes(self._buffer[position + 1 : position + length - 3])
+                sentences.append(Sentence(self._buffer_offset + position, body))
             position += length
-        else:
-            self._skip(position, len(self._buffer))
-            position = len(self._buffer)
         del self._buffer[:position]
         self._buffer_offset += position
         return sentences
 
     def _skip(self, start: int, end: int) -> None:
+        if start == end:
+            return
         gap = self._buffer[start:end]
         self.skipped_bytes += len(gap) - gap.count(b"\r") - gap.count(b"\n")  # line ends are no garbage
 
@@ -127,10 +142,16 @@ def _sentence_length(buffer: bytearray, position: int) -> int | None:
         return None
     if not _CHECKSUM.match(buffer, end):
         return 0
-    checksum = 0
-    for byte in buffer[position + 1 : end]:
-        checksum ^= byte
+    checksum = _xor(buffer[position + 1 : end])
     return end + 3 - position if checksum == int(buffer[end + 1 : end + 3], 16) else 0
+
+
+def _xor(body: bytes | bytearray) -> int:
+    """All bytes (at most 512) in one number, folded in halves: several times faster than byte by byte."""
+    value = int.from_bytes(body)
+    for fold in _FOLDS if len(body) > 128 else _FOLDS[2:]:
+        value ^= value >> fold
+    return value & 0xFF
 
 
 def _ubx_length(buffer: bytearray, position: int) -> int | None:
@@ -250,6 +271,8 @@ class NmeaDecoder:
     _last_utc_ns: int | None = None
     _ender: tuple[str, int] | None = None
     _previous_tail: tuple[str, int] | None = None
+    _time_text: str | None = None
+    _time_ns: int | None = None
 
     @property
     def bad_frames(self) -> int:
@@ -276,21 +299,29 @@ class NmeaDecoder:
         return fixes
 
     def _take(self, sentence: Sentence, fixes: list[FixSample]) -> None:
-        address = sentence.fields[0]
-        kind = address[2:]
-        if len(address) != 5 or (place := TIME_FIELD.get(kind)) is None or place >= len(sentence.fields):
+        body = sentence.body
+        place = TIME_FIELD.get(body[2:5])
+        if place is None or body[5:6] != b",":
             return
-        day_ns = _time_of_day_ns(sentence.fields[place])
+        fields = body.decode("ascii").split(",")
+        if place >= len(fields):
+            return
+        if fields[place] != self._time_text:
+            self._time_text = fields[place]
+            self._time_ns = _time_of_day_ns(self._time_text)
+        day_ns = self._time_ns
         if day_ns is None:
             return
         if self._epoch is None or self._epoch.day_ns != day_ns:
             self._close(fixes)
             self._learn()
             self._epoch = _Epoch(day_ns, sentence.offset)
-        if (gather := _GATHER.get(kind)) is not None:
-            gather(self._epoch, sentence.fields, self.rules)
-            if kind != "ZDA":  # it brings a date only, often once a second: it must neither end nor spoil an epoch
-                self._mark(address, fixes)
+        if (gather := _GATHER.get(body[2:5])) is not None:
+            gather(self._epoch, fields, self.rules)
+            if (
+                gather is not _gather_zda
+            ):  # it brings a date only, often once a second: it must neither end nor spoil an epoch
+                self._mark(fields[0], fixes)
 
     def _mark(self, address: str, fixes: list[FixSample]) -> None:
         """Note that a sentence of the fix has come, and close the epoch when it is the one that ends the cycle."""
@@ -432,12 +463,12 @@ def _gather_zda(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
         epoch.date_ns = _date_ns(*fields[2:5])
 
 
-_GATHER: dict[str, Callable[[_Epoch, list[str], FixRules], None]] = {
-    "GGA": _gather_gga,
-    "GNS": _gather_gns,
-    "RMC": _gather_rmc,
-    "GST": _gather_gst,
-    "ZDA": _gather_zda,
+_GATHER: dict[bytes, Callable[[_Epoch, list[str], FixRules], None]] = {
+    b"GGA": _gather_gga,
+    b"GNS": _gather_gns,
+    b"RMC": _gather_rmc,
+    b"GST": _gather_gst,
+    b"ZDA": _gather_zda,
 }
 
 
