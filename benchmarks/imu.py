@@ -96,7 +96,7 @@ def imu_costs_us(samples: int, repetitions: int) -> dict[str, float]:
 
 def nmea_rates_hz(lines: int, repetitions: int) -> tuple[float, float | None]:
     """Sentences a second of our decoder (to fixes) and of pynmea2 (to fields), over the same sentences."""
-    text = (DATA / "nmea" / "nmea-rtk.log").read_bytes() + (DATA / "nmea" / "rx210.log").read_bytes()
+    text = b"".join(path.read_bytes() for path in sorted((DATA / "nmea").glob("*.log")))
     sentences = [line for line in text.split(b"\n") if line.startswith(b"$G") and b"*" in line]
     sentences = (sentences * (lines // len(sentences) + 1))[:lines]
     reads = in_reads(b"\n".join(sentences) + b"\n")

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
 from itertools import accumulate
 from typing import Literal, NamedTuple
 
@@ -34,7 +35,6 @@ _START = re.compile(rb"[$!\xb5\xd3]")
 _BODY = re.compile(rb"[\x20-\x23\x25-\x29\x2b-\x7e]*")  # printable, neither $ nor *
 _CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
 _WHOLE = re.compile(rb"[\r\n]*(\$)([\x20-\x23\x25-\x29\x2b-\x7e]{0,%d})\*([0-9A-Fa-f]{2})" % (MAX_SENTENCE_BYTES - 2))
-_FOLDS = tuple(1 << bits for bits in range(11, 2, -1))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
 _COORDINATE = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
@@ -149,9 +149,16 @@ def _sentence_length(buffer: bytearray, position: int) -> int | None:
 def _xor(body: bytes | bytearray) -> int:
     """All bytes (at most 512) in one number, folded in halves: several times faster than byte by byte."""
     value = int.from_bytes(body)
-    for fold in _FOLDS if len(body) > 128 else _FOLDS[2:]:
-        value ^= value >> fold
-    return value & 0xFF
+    if len(body) > 128:
+        value ^= value >> 2048
+        value ^= value >> 1024
+    value ^= value >> 512
+    value ^= value >> 256
+    value ^= value >> 128
+    value ^= value >> 64
+    value ^= value >> 32
+    value ^= value >> 16
+    return (value ^ value >> 8) & 0xFF
 
 
 def _ubx_length(buffer: bytearray, position: int) -> int | None:
@@ -239,7 +246,7 @@ class _Epoch:
     offset: int
     gga: _Position | None = None
     is_refused: bool = False
-    rmc: _Position | None = None
+    rmc: list[str] | None = None
     gns: _Position | None = None
     date_ns: int | None = None
     sigmas_m: tuple[float, float | None] | None = None
@@ -354,7 +361,7 @@ class NmeaDecoder:
         if epoch is None or epoch.is_over:
             return
         epoch.is_over = True
-        position = epoch.gga or (None if epoch.is_refused else epoch.gns or epoch.rmc)
+        position = epoch.gga or (None if epoch.is_refused else epoch.gns or _position_of_rmc(epoch.rmc))
         if position is None or position.quality not in self.rules.qualities:
             return
         epoch.has_fix = True
@@ -418,12 +425,19 @@ def _gather_rmc(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) < 10 or fields[2] != "A":  # a void sentence may carry any date
         return
     epoch.date_ns = _date_ns(fields[9][:2], fields[9][2:4], fields[9][4:])
+    if fields[3] and fields[5]:
+        epoch.rmc = fields
+
+
+def _position_of_rmc(fields: list[str] | None) -> _Position | None:
+    """Made only where there is no better sentence."""
+    if fields is None:
+        return None
     quality = QUALITY_OF_RMC_MODE.get(fields[12], 0) if len(fields) > 12 else 1
     latitude_deg, longitude_deg = _coordinates(fields[3:7])
-    if latitude_deg is not None and longitude_deg is not None:
-        epoch.rmc = _Position(
-            fields[0].startswith("GN"), quality, latitude_deg, longitude_deg, decimals=_decimals(fields[3])
-        )
+    if latitude_deg is None or longitude_deg is None:
+        return None
+    return _Position(fields[0].startswith("GN"), quality, latitude_deg, longitude_deg, decimals=_decimals(fields[3]))
 
 
 def _gather_gns(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
@@ -522,6 +536,7 @@ def _time_of_day_ns(text: str) -> int | None:
     return (hour * 3600 + minute * 60 + second) * NS_PER_S + int((match[4] or "")[:9].ljust(9, "0"))
 
 
+@lru_cache(maxsize=8)
 def _date_ns(day: str, month: str, year: str) -> int | None:
     if not (day.isdigit() and month.isdigit() and year.isdigit() and len(year) in (2, 4)):
         return None
