@@ -86,8 +86,8 @@ def _rvc(data: bytes) -> Finding | None:
 
 def _nmea(data: bytes) -> Finding | None:
     scanner = SentenceScanner()
-    sentences = [sentence for sentence in scanner.feed(data) if not sentence.body.startswith(b"VN")]
-    explained = sum(len(sentence.body) + 6 for sentence in sentences)
+    sentences = [body for _, body in scanner.feed(data) if not body.startswith(b"VN")]
+    explained = sum(len(body) + 6 for body in sentences)
     found = _finding("nmea", "NMEA sentences", len(sentences), MIN_FRAMES, explained, data)
     if found is None and len(sentences) >= MIN_FRAMES and scanner.skipped_bytes < MIN_SHARE * len(data):
         share = 1 - scanner.skipped_bytes / len(data)  # the rest is whole UBX or RTCM messages

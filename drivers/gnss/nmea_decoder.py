@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import accumulate
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from drivers.samples import FixSample
 
@@ -58,16 +58,8 @@ class FixRules:
     vertical_per_horizontal: float = VERTICAL_PER_HORIZONTAL
 
 
-class Sentence(NamedTuple):
-    """A sentence with a good checksum; offset: of its first byte in the stream. body: between $ and *."""
-
-    offset: int
-    body: bytes
-
-    @property
-    def fields(self) -> list[str]:
-        """The first is the address (GPGGA)."""
-        return self.body.decode("ascii").split(",")
+Sentence = tuple[int, bytes]
+"""A sentence with a good checksum: how many bytes were fed before it, and what is between $ and *."""
 
 
 @dataclass(slots=True)
@@ -89,10 +81,12 @@ class SentenceScanner:
         position = 0
         while True:
             whole = _WHOLE.match(self._buffer, position)
-            if whole is not None and _xor(whole[2]) == int(whole[3], 16):
-                sentences.append(Sentence(self._buffer_offset + whole.start(1), whole[2]))
-                position = whole.end()
-                continue
+            if whole is not None:
+                body, checksum = whole.group(2, 3)
+                if _xor(body) == _HEX[checksum]:
+                    sentences.append((self._buffer_offset + whole.start(1), body))
+                    position = whole.end()
+                    continue
             match = _START.search(self._buffer, position)
             if match is None:
                 self._skip(position, len(self._buffer))
@@ -109,7 +103,7 @@ class SentenceScanner:
                 continue
             if self._buffer[position] == ord("$"):
                 body = bytes(self._buffer[position + 1 : position + length - 3])
-                sentences.append(Sentence(self._buffer_offset + position, body))
+                sentences.append((self._buffer_offset + position, body))
             position += length
         del self._buffer[:position]
         self._buffer_offset += position
@@ -190,6 +184,13 @@ def _rtcm_length(buffer: bytearray, position: int) -> int | None:
     for byte in buffer[position : position + size + 3]:
         crc = (crc << 8 & 0xFFFFFF) ^ _CRC24Q[crc >> 16 ^ byte]
     return size + 6 if crc == int.from_bytes(buffer[position + size + 3 : position + size + 6]) else 0
+
+
+def _spellings(text: str) -> set[str]:
+    return {a + b for a in (text[0], text[0].lower()) for b in (text[1], text[1].lower())}
+
+
+_HEX = {text.encode(): int(text, 16) for value in range(256) for text in _spellings(f"{value:02X}")}
 
 
 def _crc24q_table() -> list[int]:
@@ -294,9 +295,11 @@ class NmeaDecoder:
     def feed(self, data: bytes) -> list[FixSample]:
         """The fixes that `data` completes."""
         fixes: list[FixSample] = []
-        for sentence in self.scanner.feed(data):
-            self.sentences += 1
-            self._take(sentence, fixes)
+        sentences = self.scanner.feed(data)
+        self.sentences += len(sentences)
+        for offset, body in sentences:
+            if (place := TIME_FIELD.get(body[2:5])) is not None and body[5:6] == b",":
+                self._take(offset, body, place, fixes)
         return fixes
 
     def flush(self) -> list[FixSample]:
@@ -305,11 +308,8 @@ class NmeaDecoder:
         self._close(fixes)
         return fixes
 
-    def _take(self, sentence: Sentence, fixes: list[FixSample]) -> None:
-        body = sentence.body
-        place = TIME_FIELD.get(body[2:5])
-        if place is None or body[5:6] != b",":
-            return
+    def _take(self, offset: int, body: bytes, place: int, fixes: list[FixSample]) -> None:
+        """A sentence with the time in the field at `place`."""
         fields = body.decode("ascii").split(",")
         if place >= len(fields):
             return
@@ -322,7 +322,7 @@ class NmeaDecoder:
         if self._epoch is None or self._epoch.day_ns != day_ns:
             self._close(fixes)
             self._learn()
-            self._epoch = _Epoch(day_ns, sentence.offset)
+            self._epoch = _Epoch(day_ns, offset)
         if (gather := _GATHER.get(body[2:5])) is not None:
             gather(self._epoch, fields, self.rules)
             if (
