@@ -45,27 +45,57 @@ _TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
 
 
-class ByteLink(Protocol):
-    """A stream of bytes to and from a device.
-
-    byte_time_ns: how long a byte takes on the wire, 0 where bytes do not come one by one. events: what the user must
-    know of the link.
-    """
+class SerialPort(Protocol):
+    """A serial line, or another stream of bytes to and from a device, as drivers use it; see SerialLink."""
 
     byte_time_ns: float
     events: tuple[DeviceEvent, ...]
 
     def read(self, timeout_s: float) -> tuple[int, bytes]:
-        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError on hang-up."""
+        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError."""
 
     def discard_input(self) -> None:
-        """Throw away what waits unread. Raises DeviceError."""
+        """Throw away what waits unread and came at a time that is not known. Raises DeviceError."""
 
     def write(self, data: bytes) -> Chunk:
         """Send bytes; gives the chunk for the tape. Raises DeviceError."""
 
     def close(self) -> None:
-        """Close the link."""
+        """Close the port."""
+
+
+class UdpPorts(Protocol):
+    """The UDP ports of one device as drivers use them, see UdpLink."""
+
+    address: str | None
+    foreign: int
+    kernel_drops: int
+    receive_buffer_bytes: int
+
+    def read(self, timeout_s: float) -> list[Chunk]:
+        """What has come on all ports, in order of arrival; empty after `timeout_s`. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Close all ports."""
+
+
+class Links(Protocol):
+    """What a driver reaches the world through: links to its device, and the time on whose clock arrivals are."""
+
+    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
+        """Open a serial port. Raises DeviceError."""
+
+    def udp(self, address: str | None, ports: tuple[int, ...]) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address (None: the first heard). Raises DeviceError."""
+
+    def monotonic_ns(self) -> int:
+        """The time now, on the clock of arrivals."""
+
+    def utc_ns(self) -> int:
+        """UTC now, in nanoseconds since 1970."""
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass."""
 
 
 class SerialLink:
@@ -82,7 +112,7 @@ class SerialLink:
         """
         self.port = port
         try:
-            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True, dsrdtr=keep_dtr, rtscts=False)
+            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True, dsrdtr=keep_dtr)
         except (OSError, ValueError, OverflowError, termios.error) as error:
             raise DeviceError(f"{port}: cannot open at {baud} baud: {_reason(error)}{_advice(error)}") from error
         if keep_dtr:
@@ -384,13 +414,13 @@ def _packed_ipv4(address: str) -> bytes:
 class LiveLinks:
     """Real devices and real time."""
 
-    def serial(self, port: str, baud: int) -> SerialPort:
+    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
         """Open a serial port. Raises DeviceError."""
-        return SerialLink(port, baud)
+        return SerialLink(port, baud, keep_dtr=keep_dtr)
 
-    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
-        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
-        return UdpLink(address, ports, options)
+    def udp(self, address: str | None, ports: tuple[int, ...]) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address (None: the first heard). Raises DeviceError."""
+        return UdpLink(address, ports)
 
     def monotonic_ns(self) -> int:
         """The host's monotonic clock."""

@@ -16,7 +16,7 @@ from typing import Annotated, Generic, Protocol, TypeVar
 from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, StreamSpec
-from drivers.links import SILENCE_S, ByteLink, CountsBadInput, GarbageWatch, SerialLink
+from drivers.links import LIVE, SILENCE_S, CountsBadInput, GarbageWatch, Links, SerialPort
 from drivers.ports import BITS_PER_BYTE
 from drivers.recognise import describe
 from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample
@@ -83,7 +83,7 @@ class Dialogue(Generic[Message]):
     cut: gives the messages among the bytes of one read, and takes its arrival. chunks: all bytes both ways.
     """
 
-    link: ByteLink
+    link: SerialPort
     cut: Callable[[int, bytes], list[Message]]
     where: str
     chunks: list[Chunk] = field(default_factory=list)
@@ -293,10 +293,11 @@ class SerialDriver(ABC, Generic[Decoder]):
 
     def __init__(self, config: SerialConfig, rate_hz: float) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._serial = config
         self._rate_hz = rate_hz
         self._identity: dict[str, str] = {}
-        self._link: ByteLink | None = None
+        self._link: SerialPort | None = None
         self._begun = Received()
         self._early: list[tuple[int, Sample]] = []
         self._renew()
@@ -333,11 +334,11 @@ class SerialDriver(ABC, Generic[Decoder]):
     def _check(self) -> None:
         """Raise DeviceError for what cannot work, before anything is opened."""
 
-    def _configure(self, link: ByteLink) -> Received:
+    def _configure(self, link: SerialPort) -> Received:
         """All but the start of the measurement, so that nothing waits in the port. Gives what was said."""
         return Received()
 
-    def _begin(self, link: ByteLink) -> tuple[Chunk, ...]:
+    def _begin(self, link: SerialPort) -> tuple[Chunk, ...]:
         """Let the device measure, or where it does so already throw away what waits: its arrival is not known."""
         link.discard_input()
         return ()
@@ -356,7 +357,7 @@ class SerialDriver(ABC, Generic[Decoder]):
         self._arrivals = Arrivals()
         self._early = []
 
-    def _dialogue(self, link: ByteLink, replies: deque[Message]) -> Dialogue[Message]:
+    def _dialogue(self, link: SerialPort, replies: deque[Message]) -> Dialogue[Message]:
         """A dialogue whose answers the decoder puts into `replies`; samples in between are kept in `_early`."""
 
         def cut(arrival_ns: int, data: bytes) -> list[Message]:
@@ -383,7 +384,7 @@ class SerialDriver(ABC, Generic[Decoder]):
         self.close()
         self._renew()
         self._begun = Received()
-        self._link = SerialLink(self._serial.port, self._serial.baud, keep_dtr=self._serial.keep_dtr)
+        self._link = self.links.serial(self._serial.port, self._serial.baud, keep_dtr=self._serial.keep_dtr)
         try:
             self._begun = self._configure(self._link)
         except DeviceError:

@@ -7,7 +7,7 @@ import time
 from collections import deque
 
 from drivers.device import DeviceError
-from drivers.links import READ_BYTES, UdpLink
+from drivers.links import READ_BYTES, Links
 from drivers.samples import Chunk, DeviceEvent
 
 CONNECT_S = 5.0
@@ -83,10 +83,11 @@ class UdpByteLink:
     byte_time_ns = 0.0
     events: tuple[DeviceEvent, ...] = ()
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, links: Links, address: str) -> None:
         """Listen as [sender]:port says; without a sender the first one that is heard. Raises DeviceError."""
         sender, port = host_and_port(address if ":" in address else f":{address}", "udp")
-        self._link = UdpLink(sender or None, (port,))
+        self._links = links
+        self._link = links.udp(sender or None, (port,))
         self._waiting: deque[Chunk] = deque()
         self.last: Chunk | None = None
 
@@ -95,7 +96,7 @@ class UdpByteLink:
         if not self._waiting:
             self._waiting.extend(self._link.read(timeout_s))
         self.last = self._waiting.popleft() if self._waiting else None
-        return (self.last.arrival_ns, self.last.data) if self.last else (time.monotonic_ns(), b"")
+        return (self.last.arrival_ns, self.last.data) if self.last else (self._links.monotonic_ns(), b"")
 
     def discard_input(self) -> None:
         """Throw away what waits unread."""

@@ -1,6 +1,5 @@
 """Any GNSS receiver that sends NMEA 0183, on a serial port, over TCP or UDP. It is listened to, never configured."""
 
-import time
 from collections.abc import Iterator
 from threading import Event
 from typing import Annotated, Literal
@@ -17,7 +16,7 @@ from drivers.gnss.nmea_decoder import (
     FixRules,
     NmeaDecoder,
 )
-from drivers.links import SILENCE_S, ByteLink, SerialLink
+from drivers.links import LIVE, SILENCE_S, Links, SerialPort
 from drivers.samples import Chunk, DeviceEvent, FixSample, Received, Sample
 from drivers.serial_care import USABLE_SHARE, Arrivals, Care, usable_bytes_per_s
 
@@ -65,9 +64,10 @@ class NmeaDriver:
 
     def __init__(self, name: str, config: NmeaConfig) -> None:
         """Nothing is opened yet."""
+        self.links: Links = LIVE
         self._config = config
         self._where = f"{config.port} at {config.baud} baud" if config.port else config.tcp or f"UDP {config.udp}"
-        self._link: ByteLink | None = None
+        self._link: SerialPort | None = None
         self.streams = (StreamSpec("gnss", config.rate_hz, config.rate_hz * FIX_BYTES),)
 
     @property
@@ -80,9 +80,9 @@ class NmeaDriver:
         self.close()
         config = self._config
         if config.port:
-            self._link = SerialLink(config.port, config.baud, keep_dtr=config.keep_dtr)
+            self._link = self.links.serial(config.port, config.baud, keep_dtr=config.keep_dtr)
         else:
-            self._link = TcpLink(config.tcp) if config.tcp else UdpByteLink(config.udp)
+            self._link = TcpLink(config.tcp) if config.tcp else UdpByteLink(self.links, config.udp)
 
     def read(self, stop: Event) -> Iterator[Received]:
         """Yield what comes. Raises DeviceError when the receiver is gone or silent."""
@@ -92,7 +92,7 @@ class NmeaDriver:
         period_s = 1 / self._config.rate_hz
         idle_s = max(MIN_IDLE_S, IDLE_SHARE * period_s)
         link.discard_input()  # the arrival of what waits is not known
-        decoder = NmeaDecoder(time.time_ns(), rules=self._rules())
+        decoder = NmeaDecoder(self.links.utc_ns(), rules=self._rules())
         arrivals = Arrivals(link.byte_time_ns)
         watch = _Watch(decoder, self._where, self._config)
         care = Care(
@@ -140,7 +140,7 @@ class NmeaDriver:
 DRIVER = DriverType(config=NmeaConfig, create=NmeaDriver)
 
 
-def _chunks(link: ByteLink, arrival_ns: int, data: bytes) -> tuple[Chunk, ...]:
+def _chunks(link: SerialPort, arrival_ns: int, data: bytes) -> tuple[Chunk, ...]:
     if not data:
         return ()
     if isinstance(link, UdpByteLink) and link.last is not None:

@@ -21,7 +21,7 @@ from drivers.imu.mip_decoder import (
     fields,
     fletcher,
 )
-from drivers.links import ByteLink
+from drivers.links import SerialPort
 from drivers.samples import Chunk, DeviceEvent, Received
 from drivers.serial_care import Dialogue, RefusedError, SerialConfig, SerialDriver, Watch, check_bandwidth
 
@@ -87,7 +87,7 @@ class MicrostrainDriver(SerialDriver[MipDecoder]):
                 rates,
             )
 
-    def _configure(self, link: ByteLink) -> Received:
+    def _configure(self, link: SerialPort) -> Received:
         if not self._config.configure:
             return Received()
         dialogue = self._dialogue(link, self._decoder.replies)
@@ -131,7 +131,7 @@ class MicrostrainDriver(SerialDriver[MipDecoder]):
         text = f"{self.where}: asked for {self._config.rate_hz:g} Hz, the device gives {self._rate_hz:g} Hz"
         return decimation, (DeviceEvent("warning", text),)
 
-    def _begin(self, link: ByteLink) -> tuple[Chunk, ...]:
+    def _begin(self, link: SerialPort) -> tuple[Chunk, ...]:
         if not self._config.configure:
             return super()._begin(link)
         dialogue = self._dialogue(link, self._decoder.replies)

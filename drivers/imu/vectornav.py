@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from drivers.device import DeviceError, DriverType
 from drivers.imu.vectornav_decoder import MAX_LINE_BYTES, VectornavDecoder
-from drivers.links import ByteLink
+from drivers.links import SerialPort
 from drivers.samples import Chunk, DeviceEvent, Received
 from drivers.serial_care import Dialogue, RefusedError, SerialConfig, SerialDriver, Watch, check_bandwidth
 
@@ -87,7 +87,7 @@ class VectornavDriver(SerialDriver[VectornavDecoder]):
             )
         check_bandwidth(config.port, config.rate_hz, config.baud, lambda rate_hz: rate_hz * self._sample_bytes(), rates)
 
-    def _configure(self, link: ByteLink) -> Received:
+    def _configure(self, link: SerialPort) -> Received:
         if not self._config.configure:
             return Received()
         dialogue = self._dialogue(link, self._decoder.replies)
@@ -117,7 +117,7 @@ class VectornavDriver(SerialDriver[VectornavDecoder]):
         text = f"{self.where}: asked for {self._config.rate_hz:g} Hz, the {model} gives {self._rate_hz:g} Hz"
         return divisor, (DeviceEvent("warning", text),)
 
-    def _begin(self, link: ByteLink) -> tuple[Chunk, ...]:
+    def _begin(self, link: SerialPort) -> tuple[Chunk, ...]:
         if not self._config.configure:
             return super()._begin(link)
         dialogue = self._dialogue(link, self._decoder.replies)

@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from drivers.device import DeviceError, DriverType
 from drivers.imu.witmotion_decoder import FRAME_BYTES, VENDOR_G_M_S2, WitmotionDecoder
-from drivers.links import ByteLink
+from drivers.links import SerialPort
 from drivers.samples import Chunk, ImuSample, Received
 from drivers.serial_care import SerialConfig, SerialDriver, check_bandwidth
 
@@ -61,7 +61,7 @@ class WitmotionDriver(SerialDriver[WitmotionDecoder]):
             raise DeviceError(f"{config.port}: rate_hz {config.rate_hz:g}: it can be {', '.join(map(str, RATE_CODES))}")
         check_bandwidth(config.port, config.rate_hz, config.baud, lambda rate_hz: rate_hz * 44, list(RATE_CODES))
 
-    def _configure(self, link: ByteLink) -> Received:
+    def _configure(self, link: SerialPort) -> Received:
         if not self._config.configure:
             return Received()
         rate = bytes((0xFF, 0xAA, 0x03, RATE_CODES[int(self._config.rate_hz)], 0x00))

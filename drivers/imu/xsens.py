@@ -20,7 +20,7 @@ from drivers.imu.mtdata2 import (
     Frame,
     Mtdata2Decoder,
 )
-from drivers.links import ByteLink
+from drivers.links import SerialPort
 from drivers.samples import Chunk, DeviceEvent, Received
 from drivers.serial_care import (
     LINE_BYTES,
@@ -94,7 +94,6 @@ class XsensDriver(SerialDriver[Mtdata2Decoder]):
 
     def __init__(self, name: str, config: XsensConfig) -> None:
         """Nothing is opened yet."""
-        self.links: Links = LIVE
         self._config = config
         super().__init__(config, config.rate_hz)
 
@@ -128,7 +127,7 @@ class XsensDriver(SerialDriver[Mtdata2Decoder]):
                 RATES_HZ,
             )
 
-    def _configure(self, link: ByteLink) -> Received:
+    def _configure(self, link: SerialPort) -> Received:
         if not self._config.configure:
             return Received()
         dialogue = self._dialogue(link, self._decoder.replies)
@@ -141,7 +140,7 @@ class XsensDriver(SerialDriver[Mtdata2Decoder]):
         self._identity = {"serial": device_id.hex().upper(), "firmware": ".".join(map(str, firmware[:3]))}
         return Received(tuple(dialogue.chunks), events=warnings)
 
-    def _begin(self, link: ByteLink) -> tuple[Chunk, ...]:
+    def _begin(self, link: SerialPort) -> tuple[Chunk, ...]:
         if not self._config.configure:
             return super()._begin(link)
         dialogue = self._dialogue(link, self._decoder.replies)

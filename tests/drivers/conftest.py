@@ -8,8 +8,8 @@ from threading import Event, Thread
 
 import pytest
 
-from drivers import serial_care
-from drivers.samples import Received
+from drivers import links
+from drivers.samples import Chunk, Received
 
 
 class PtyDevice:
@@ -98,7 +98,7 @@ class ScriptedLink:
 
     def write(self, data: bytes):
         self.written += data
-        return serial_care.Chunk(0, data, sent=True)
+        return Chunk(0, data, sent=True)
 
     def discard_input(self) -> None:
         pass
@@ -113,7 +113,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch):
 
     def read(driver, reads, count=None, byte_time_ns=0.0) -> list[Received]:
         link = ScriptedLink(reads, byte_time_ns)
-        monkeypatch.setattr(serial_care, "SerialLink", lambda port, baud, keep_dtr: link)
+        monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: link)
         driver.connect()
         reading = driver.read(Event())
         parts = [next(reading) for _ in range(2 + (len(reads) if count is None else count))]

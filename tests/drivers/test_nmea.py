@@ -387,7 +387,7 @@ class ScriptedLink:
 def scripted(
     monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], rate_hz: float = 10
 ) -> Iterator[Received]:
-    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", rate_hz)
     driver.connect()
     assert [(stream.kind, stream.rate_hz) for stream in driver.streams] == [("gnss", rate_hz)]
@@ -470,7 +470,7 @@ def test_gns_serves_where_there_is_no_gga() -> None:
 
 def test_open_epoch_is_given_out_at_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     stop = Event()
-    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink([(1000, gga())]))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink([(1000, gga())]))
     driver = make_driver("/dev/ttyX")
     driver.connect()
     reading = driver.read(stop)
@@ -481,7 +481,7 @@ def test_open_epoch_is_given_out_at_the_stop(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def events_of(monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], **keys: object) -> list[str]:
-    monkeypatch.setattr(nmea, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
     driver = DRIVER.create("gnss", NmeaConfig(**{"driver": "nmea", "port": "/dev/ttyX", "rate_hz": 10, **keys}))
     driver.connect()
     texts = []

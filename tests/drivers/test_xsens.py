@@ -13,7 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers import serial_care
+from drivers import links, serial_care
 from drivers.device import DeviceError
 from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder, XbusFramer, decode_mtdata2, mtdata2_items
 from drivers.imu.xsens import DRIVER, XsensConfig, XsensDriver
@@ -444,7 +444,7 @@ class ScriptedLink:
 
 
 def scripted(monkeypatch: pytest.MonkeyPatch, reads: list[tuple[float, bytes]]) -> Iterator[Received]:
-    monkeypatch.setattr(serial_care, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", configure=False)
     driver.connect()
     return driver.read(Event())
