@@ -402,7 +402,9 @@ class SerialDriver(ABC, Generic[Decoder]):
         chunks = self._begin(link)
         yield Received(chunks, tuple(self._early))
         decoder, rate = self._decoder, RateWatch(self._rate_hz, self.where)
-        watches: list[Watch] = [GapWatch(decoder, self.lost_by), rate, *self._watches()]
+        watches: list[Watch] = [GapWatch(decoder, self.lost_by), *self._watches()]
+        if self.links is LIVE:  # a capture may be played at any rate
+            watches.append(rate)
         care = Care(decoder, lambda: decoder.frames, self.message, self.where, self.cut_bytes, watches=watches)
         while not stop.is_set():
             arrival_ns, data = link.read(READ_S)

@@ -94,7 +94,7 @@ class NmeaDriver:
         link.discard_input()  # the arrival of what waits is not known
         decoder = NmeaDecoder(self.links.utc_ns(), rules=self._rules())
         arrivals = Arrivals(link.byte_time_ns)
-        watch = _Watch(decoder, self._where, self._config)
+        watch = _Watch(decoder, self._where, self._config, has_baud_rate=link.byte_time_ns > 0)
         care = Care(
             decoder,
             lambda: decoder.sentences,
@@ -155,7 +155,8 @@ def _stamped(arrivals: Arrivals, fixes: list[FixSample]) -> tuple[tuple[int, Sam
 class _Watch:
     """What a user should know of a receiver that runs: its date, a line that is full, positions that are too coarse."""
 
-    def __init__(self, decoder: NmeaDecoder, where: str, config: NmeaConfig) -> None:
+    def __init__(self, decoder: NmeaDecoder, where: str, config: NmeaConfig, *, has_baud_rate: bool) -> None:
+        self._has_baud_rate = has_baud_rate
         self._decoder = decoder
         self._where = where
         self._config = config
@@ -197,7 +198,7 @@ class _Watch:
         if self._load_since_ns is None:
             self._load_since_ns, self._bytes = arrival_ns, 0
         elapsed_ns = arrival_ns - self._load_since_ns
-        if not self._config.port or elapsed_ns < LOAD_OVER_NS:
+        if not self._has_baud_rate or elapsed_ns < LOAD_OVER_NS:
             return
         bytes_per_s = self._bytes * 1e9 / elapsed_ns
         self._load_since_ns, self._bytes = arrival_ns, 0

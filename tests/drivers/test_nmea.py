@@ -496,6 +496,8 @@ def test_coarse_rtk_full_line_and_missing_separation_are_warned_of(monkeypatch: 
     (text,) = events_of(monkeypatch, fixed)
     assert "RTK positions come with 3 decimals of a minute" in text
     sentences = [(at_ms, gga(f"12000{i // 10}.{i % 10}0")) for i, (at_ms, _) in enumerate(fixed)]
+    assert events_of(monkeypatch, sentences, baud=4800) == []  # of a pty the baud rate means nothing
+    monkeypatch.setattr(ScriptedLink, "byte_time_ns", 1e10 / 4800)
     (text,) = events_of(monkeypatch, sentences, baud=4800)
     assert "bytes/s are more than 90% of what the line carries" in text
     no_undulation = sentence("GPGGA,120000.00,6010.428,N,02454.390,E,1,12,0.80,14.2,M,,M,,")

@@ -120,11 +120,14 @@ def check(target: Target, data: bytes) -> None:
     size, stream = data[:1][0] % 64 + 1 if data else 1, data[1:]
     whole, split = target.make(), target.make()
     expected = whole.feed(stream)
-    samples = []
+    expected_starts = list(getattr(whole, "starts", []))
+    samples, starts = [], []
     for start in range(0, len(stream), size):
         samples += split.feed(stream[start : start + size])
+        starts += getattr(split, "starts", [])
         assert target.buffer(split) <= target.bound_bytes
     assert repr(samples) == repr(expected)
+    assert starts == expected_starts
     assert (split.bad_frames, split.skipped_bytes) == (whole.bad_frames, whole.skipped_bytes)
     # A false start may hold what follows back, but not for longer than a frame is.
     count = 4 + (target.bound_bytes + MAX_SENTENCE_BYTES) // len(target.good)
