@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.gnss.nmea_decoder import SentenceScanner
+from drivers.gnss.nmea_scanner import SentenceScanner
 from drivers.imu.ascii_decoder import MAX_LINE_BYTES
 from drivers.imu.mip_decoder import MipDecoder
 from drivers.imu.mtdata2 import XbusFramer

@@ -267,7 +267,7 @@ def check_bandwidth(
         return
     rates = (rate for rate in sorted(rates_hz, reverse=True) if bytes_per_s(rate) <= usable)
     bauds = (faster for faster in BAUDS if needed <= usable_bytes_per_s(faster))
-    advice = [f"rate_hz {rate} or less" for rate in list(rates)[:1]]
+    advice = [f"rate_hz {rate:g} or less" for rate in list(rates)[:1]]
     advice += [f"baud {faster} or more (here and in the device)" for faster in list(bauds)[:1]]
     raise DeviceError(
         f"{port}: {rate_hz:g} Hz need {needed:.0f} bytes/s, and {baud} baud carry {usable:.0f} "

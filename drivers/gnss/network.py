@@ -59,10 +59,13 @@ class TcpLink:
         return time.monotonic_ns(), data
 
     def discard_input(self) -> None:
-        """Throw away what waits unread."""
-        with contextlib.suppress(BlockingIOError):
-            while self._socket.recv(READ_BYTES):
-                pass
+        """Throw away what waits unread. Raises DeviceError."""
+        try:
+            with contextlib.suppress(BlockingIOError):
+                while self._socket.recv(READ_BYTES):
+                    pass
+        except OSError as error:
+            raise DeviceError(f"{self._where}: connection lost: {error}") from error
 
     def write(self, data: bytes) -> Chunk:
         """Send bytes; gives the chunk for the tape. Raises DeviceError."""

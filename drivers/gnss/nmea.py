@@ -10,12 +10,12 @@ from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.gnss.network import TcpLink, UdpByteLink
 from drivers.gnss.nmea_decoder import (
     EMITTED_QUALITIES,
-    MAX_SENTENCE_BYTES,
     UERE_M,
     VERTICAL_PER_HORIZONTAL,
     FixRules,
     NmeaDecoder,
 )
+from drivers.gnss.nmea_scanner import MAX_SENTENCE_BYTES
 from drivers.links import LIVE, SILENCE_S, Links, SerialPort
 from drivers.samples import Chunk, DeviceEvent, FixSample, Received, Sample
 from drivers.serial_care import USABLE_SHARE, Arrivals, Care, usable_bytes_per_s

@@ -15,6 +15,7 @@ from drivers.imu.mip_decoder import (
     MAX_PACKET_BYTES,
     REFERENCE_TIME,
     SENSOR_SET,
+    TICKS,
     MipDecoder,
     Packet,
     TimeSource,
@@ -31,6 +32,7 @@ IMU_BASE_RATE, IMU_FORMAT, BASE_RATE, FORMAT, STREAM = 0x06, 0x08, 0x0E, 0x0F, 0
 ACKNOWLEDGEMENT = 0xF1
 WRITE = 0x01
 LEGACY_IMU_STREAM = 0x01
+TIME_FIELDS: dict[TimeSource, int] = {"reference": REFERENCE_TIME, "gps": GPS_CORRELATION, "ticks": TICKS}
 PACKET_BYTES = 6 + 10 + 3 * 14
 ERROR_TEXTS = {1: "unknown command", 2: "invalid checksum", 3: "invalid parameter", 4: "command failed", 5: "timeout"}
 DEFAULT_BASE_RATE_HZ = 1000
@@ -105,14 +107,16 @@ class MicrostrainDriver(SerialDriver[MipDecoder]):
     def _set_format(self, dialogue: Dialogue[Packet]) -> tuple[DeviceEvent, ...]:
         answer = ask(dialogue, "base rate", SENSOR_COMMANDS, BASE_RATE, bytes((SENSOR_SET,)), reply=0x8E)
         decimation, events = self._decimation(int.from_bytes(answer[1:3]))
-        outputs = _outputs((REFERENCE_TIME, ACCEL, GYRO, MAG), decimation)
+        outputs = _outputs((TIME_FIELDS[self._config.time_source], ACCEL, GYRO, MAG), decimation)
         ask(dialogue, "message format", SENSOR_COMMANDS, FORMAT, bytes((WRITE, SENSOR_SET)) + outputs)
         ask(dialogue, "stream control", SENSOR_COMMANDS, STREAM, bytes((WRITE, SENSOR_SET, 1)))
-        self._time_source = "reference"
+        self._time_source = self._config.time_source
         return events
 
     def _set_legacy_format(self, dialogue: Dialogue[Packet]) -> tuple[DeviceEvent, ...]:
-        """Models before the reference time."""
+        """Models before the reference time. Raises DeviceError when their ticks are asked for."""
+        if self._config.time_source == "ticks":
+            raise DeviceError(f"{self.where}: this model has no tick counter; set time_source to gps")
         answer = ask(dialogue, "IMU base rate", SENSOR_COMMANDS, IMU_BASE_RATE, reply=0x83)
         decimation, events = self._decimation(int.from_bytes(answer[:2]))
         outputs = _outputs((GPS_CORRELATION, ACCEL, GYRO, MAG), decimation)

@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from drivers import links
 from drivers.device import DeviceError
 from drivers.gnss.nmea import DRIVER, NmeaConfig, NmeaDriver
-from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, FixRules, NmeaDecoder
+from drivers.gnss.nmea_decoder import FixRules, NmeaDecoder
+from drivers.gnss.nmea_scanner import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES
 from drivers.samples import Chunk, FixSample, Received
 
 DATA = Path(__file__).parent.parent / "data" / "nmea"

@@ -21,7 +21,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, NmeaDecoder
+from drivers.gnss.nmea_decoder import NmeaDecoder
+from drivers.gnss.nmea_scanner import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES
 from drivers.imu.ascii_decoder import MAX_LINE_BYTES, AsciiDecoder, LineFormat
 from drivers.imu.mip_decoder import MAX_PACKET_BYTES, MipDecoder
 from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder
