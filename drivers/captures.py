@@ -244,7 +244,7 @@ class CaptureLinks:
         self._jump(_is_serial)
         return CaptureSerialPort(self)
 
-    def udp(self, address: str | None, ports: tuple[int, ...]) -> UdpPorts:
+    def udp(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
         """Datagrams to these ports, from the next one on. Raises DeviceError when it is over."""
         if not self.capture.has_arrivals:
             raise DeviceError(f"{self.capture.path}: is no pcap or pcapng, and this device sends datagrams")
@@ -374,7 +374,7 @@ class CaptureUdpPorts:
     kernel_drops = 0
     receive_buffer_bytes = 1 << 40
 
-    def __init__(self, links: CaptureLinks, address: str | None, ports: tuple[int, ...]) -> None:
+    def __init__(self, links: CaptureLinks, address: str | None, ports: tuple[int, ...], source_port: int = 0) -> None:
         self.address = address
         self.source_port = source_port
         self.foreign = 0
@@ -387,7 +387,7 @@ class CaptureUdpPorts:
             return False
         if self.address is None:
             self.address = chunk.source[0]
-        if chunk.source[0] != self.address:
+        if chunk.source[0] != self.address or self.source_port not in (0, chunk.source[1]):
             self.foreign += 1
             return False
         return True

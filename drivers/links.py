@@ -26,8 +26,25 @@ import numpy as np
 import serial
 
 from drivers.device import DeviceError
-from drivers.ports import find_port
+from drivers.garbage import CountsBadInput, GarbageWatch
+from drivers.ports import Links, SerialPort, UdpOptions, UdpPorts
 from drivers.samples import Chunk, DeviceEvent
+from drivers.serial_ports import find_port
+from drivers.udp_batches import SLOTS, BatchReceiver
+
+__all__ = [
+    "LIVE",
+    "SILENCE_S",
+    "CountsBadInput",
+    "GarbageWatch",
+    "Links",
+    "LiveLinks",
+    "SerialLink",
+    "SerialPort",
+    "UdpLink",
+    "UdpOptions",
+    "UdpPorts",
+]
 
 READ_BYTES = 65536
 DATAGRAM_BYTES = 65535
@@ -43,59 +60,6 @@ SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
 _TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
-
-
-class SerialPort(Protocol):
-    """A serial line, or another stream of bytes to and from a device, as drivers use it; see SerialLink."""
-
-    byte_time_ns: float
-    events: tuple[DeviceEvent, ...]
-
-    def read(self, timeout_s: float) -> tuple[int, bytes]:
-        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError."""
-
-    def discard_input(self) -> None:
-        """Throw away what waits unread and came at a time that is not known. Raises DeviceError."""
-
-    def write(self, data: bytes) -> Chunk:
-        """Send bytes; gives the chunk for the tape. Raises DeviceError."""
-
-    def close(self) -> None:
-        """Close the port."""
-
-
-class UdpPorts(Protocol):
-    """The UDP ports of one device as drivers use them, see UdpLink."""
-
-    address: str | None
-    foreign: int
-    kernel_drops: int
-    receive_buffer_bytes: int
-
-    def read(self, timeout_s: float) -> list[Chunk]:
-        """What has come on all ports, in order of arrival; empty after `timeout_s`. Raises DeviceError."""
-
-    def close(self) -> None:
-        """Close all ports."""
-
-
-class Links(Protocol):
-    """What a driver reaches the world through: links to its device, and the time on whose clock arrivals are."""
-
-    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
-        """Open a serial port. Raises DeviceError."""
-
-    def udp(self, address: str | None, ports: tuple[int, ...]) -> UdpPorts:
-        """Open UDP ports for the datagrams of one address (None: the first heard). Raises DeviceError."""
-
-    def monotonic_ns(self) -> int:
-        """The time now, on the clock of arrivals."""
-
-    def utc_ns(self) -> int:
-        """UTC now, in nanoseconds since 1970."""
-
-    def sleep(self, duration_s: float) -> None:
-        """Let time pass."""
 
 
 class SerialLink:
@@ -183,14 +147,14 @@ class SerialLink:
 class UdpLink:
     """UDP ports of one device: datagrams from its address, with the kernel's arrival time.
 
-    address: the device's own (None: that of the first datagram); datagrams from others are counted in `foreign` and not
-    given out. A device on loopback is listened for on loopback only. kernel_drops: what the kernel dropped for want of
-    room, as it reports.
+    address: the device's own address; datagrams from others are counted in `foreign` and not given out. A device on
+    loopback is listened for on loopback only. kernel_drops: what the kernel dropped for want of room, as it reports.
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
-    def __init__(self, address: str | None, ports: tuple[int, ...]) -> None:
-        """Bind the ports. Raises DeviceError when one is taken or the address is not an IPv4 address."""
+    def __init__(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> None:
+        """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address."""
+        options = options or UdpOptions()
         self.address = address
         self.source_port = options.source_port
         self.foreign = 0
@@ -202,10 +166,17 @@ class UdpLink:
         self._readable = select.poll()
         self._realtime_minus_monotonic_ns = _realtime_minus_monotonic_ns()
         try:
-            packed = socket.inet_pton(socket.AF_INET, "0.0.0.0" if address is None else address)
-        except OSError as error:
-            raise DeviceError(f"address {address!r}: not an IPv4 address") from error
-        bind_address = "127.0.0.1" if packed[0] == 127 else "0.0.0.0"
+            self._batches: BatchReceiver | None = BatchReceiver()
+        except OSError:
+            self._batches = None
+        member = b""
+        if options.multicast_group:
+            member = _packed_ipv4(options.multicast_group) + _packed_ipv4(options.interface or "0.0.0.0")
+        bind_address = (
+            "127.0.0.1"
+            if _packed_ipv4("0.0.0.0" if address is None else address)[0] == 127 and not options.multicast_group
+            else "0.0.0.0"
+        )
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
             udp = self._share(bind_address, port) if options.shared else self._bind(bind_address, port)
@@ -238,7 +209,9 @@ class UdpLink:
                 raise DeviceError(f"multicast group {options.multicast_group}{where}: {_reason(error)}") from error
 
     def accepts(self, source: tuple[str, int]) -> bool:
-        """Whether a datagram from there is of this link's device."""
+        """Whether a datagram from there is of this link's device; the first one tells, where no address is given."""
+        if self.address is None:
+            self.address = source[0]
         return source[0] == self.address and self.source_port in (0, source[1])
 
     def _bind(self, bind_address: str, port: int) -> socket.socket:
@@ -348,12 +321,18 @@ class UdpLink:
                         arrival_ns = stamp_ns
                 elif kind == SO_RXQ_OVFL:
                     self._count_kernel_drops(udp.fileno(), _UINT32.unpack_from(payload)[0])
-            if self.address is None:
-                self.address = source[0]
-            if source[0] != self.address:
-                self.foreign += 1
-                continue
-            chunks.append(Chunk(arrival_ns, bytes(self._buffer[:size]), source, destination))
+            self._accept(udp, arrival_ns, bytes(self._buffer[:size]), source, destination, chunks)
+
+    def _deal_out(self, udp: socket.socket, chunk: Chunk, chunks: list[Chunk]) -> None:
+        """Give a datagram to all links that accept it; one that nobody accepts is foreign to the one that read it."""
+        assert chunk.source is not None
+        takers = [link for link in self._shared[udp.fileno()].links if link.accepts(chunk.source)]
+        self.foreign += not takers
+        for link in takers:
+            if link is self:
+                chunks.append(chunk)
+            else:
+                link._given.append(chunk)  # noqa: SLF001
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
         seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket
@@ -418,9 +397,9 @@ class LiveLinks:
         """Open a serial port. Raises DeviceError."""
         return SerialLink(port, baud, keep_dtr=keep_dtr)
 
-    def udp(self, address: str | None, ports: tuple[int, ...]) -> UdpPorts:
-        """Open UDP ports for the datagrams of one address (None: the first heard). Raises DeviceError."""
-        return UdpLink(address, ports)
+    def udp(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
+        return UdpLink(address, ports, options)
 
     def monotonic_ns(self) -> int:
         """The host's monotonic clock."""
@@ -436,46 +415,6 @@ class LiveLinks:
 
 
 LIVE: Links = LiveLinks()
-
-
-class CountsBadInput(Protocol):
-    """A decoder: it counts what it could not use."""
-
-    @property
-    def bad_frames(self) -> int:
-        """Candidates for a frame that were none."""
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Bytes outside of frames."""
-
-
-@dataclass(slots=True)
-class GarbageWatch:
-    """Turns a decoder's counters of bad input into one event per burst (ended by a second without any).
-
-    A burst that does not end is told every ten seconds.
-    """
-
-    decoder: CountsBadInput
-    _reported: tuple[int, int] = (0, 0)
-    _seen: tuple[int, int] = (0, 0)
-    _begin_ns: int = 0
-    _last_growth_ns: int = 0
-
-    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
-        """The event of a burst that is over, else nothing."""
-        counters = (self.decoder.bad_frames, self.decoder.skipped_bytes)
-        if counters != self._seen:
-            if self._seen == self._reported:
-                self._begin_ns = now_ns
-            self._seen, self._last_growth_ns = counters, now_ns
-        is_over = now_ns - self._last_growth_ns >= BURST_END_NS or now_ns - self._begin_ns >= BURST_MAX_NS
-        if self._seen == self._reported or not is_over:
-            return ()
-        frames, skipped = (new - old for new, old in zip(self._seen, self._reported, strict=True))
-        self._reported = self._seen
-        return (DeviceEvent("garbage", f"{frames} bad frames, {skipped} bytes skipped", frames or skipped),)
 
 
 def _realtime_minus_monotonic_ns() -> int:

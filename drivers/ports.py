@@ -1,98 +1,74 @@
-"""What the system knows of a serial port: what kind of line it is, its adapter's latency timer, its lasting name."""
+"""What a driver sees of its links: the seam between drivers and the real world, or a capture played instead."""
 
-import contextlib
-import os
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import Protocol
 
-SYSTEM = Path("/")
-LATENCY_TIMER_MS = 1
-TOLERATED_LATENCY_TIMER_MS = 2
-BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+from drivers.samples import Chunk, DeviceEvent
+
+
+class SerialPort(Protocol):
+    """A serial line, or another stream of bytes to and from a device, as drivers use it; see SerialLink."""
+
+    byte_time_ns: float
+    events: tuple[DeviceEvent, ...]
+
+    def read(self, timeout_s: float) -> tuple[int, bytes]:
+        """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError."""
+
+    def discard_input(self) -> None:
+        """Throw away what waits unread and came at a time that is not known. Raises DeviceError."""
+
+    def write(self, data: bytes) -> Chunk:
+        """Send bytes; gives the chunk for the tape. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Close the port."""
 
 
 @dataclass(frozen=True, slots=True)
-class Port:
-    """A serial port as the system describes it.
+class UdpOptions:
+    """What a device that sends datagrams may need beyond its address and ports.
 
-    kind: only a uart sends its bytes at the baud rate; USB serial devices (cdc) and ptys send them as they come.
-    latency_timer_ms: how long an FTDI adapter holds bytes back, None where there is no such thing.
-    lasting_name: under /dev/serial, None when `path` is it or there is none.
+    source_port: the device's own port, 0: any. multicast_group: joined on the interface with this host's address
+    `interface` (empty: as the system chooses). shared: other links of this process may use the same ports, each for
+    its own device, or for its own part of what that device sends there.
     """
 
-    path: str
-    kind: Literal["uart", "cdc", "pty", "unknown"]
-    latency_timer: Path | None = None
-    lasting_name: str | None = None
-
-    @property
-    def latency_timer_ms(self) -> int | None:
-        """As it is now."""
-        if self.latency_timer is None:
-            return None
-        try:
-            return int(self.latency_timer.read_text())
-        except (OSError, ValueError):
-            return None
-
-    def byte_time_ns(self, baud: int) -> float:
-        """How long one byte takes on the wire; 0 where bytes do not come one by one."""
-        return BITS_PER_BYTE * 1e9 / baud if self.kind == "uart" else 0.0
-
-    def shorten_latency(self) -> str | None:
-        """Set the latency timer to 1 ms; what to tell the user where that is not allowed."""
-        if (before_ms := self.latency_timer_ms) is None or before_ms <= TOLERATED_LATENCY_TIMER_MS:
-            return None
-        assert self.latency_timer is not None
-        with contextlib.suppress(OSError):
-            self.latency_timer.write_text(f"{LATENCY_TIMER_MS}\n")
-        left_ms = self.latency_timer_ms
-        if left_ms is None or left_ms <= TOLERATED_LATENCY_TIMER_MS:
-            return None
-        return (
-            f"{self.path}: the adapter holds bytes back for {left_ms} ms (latency timer), so samples arrive in bursts; "
-            f"once, until replugged: echo {LATENCY_TIMER_MS} | sudo tee {self.latency_timer}"
-        )
-
-    def advice(self) -> str | None:
-        """What to tell the user of the name that he chose."""
-        if self.lasting_name is None:
-            return None
-        return f"{self.path} may be another device after replugging; {self.lasting_name} stays the same"
+    source_port: int = 0
+    multicast_group: str = ""
+    interface: str = ""
+    shared: bool = False
 
 
-def find_port(path: str, system: Path = SYSTEM) -> Port:
-    """Look a port up. Never raises: a port that is not known is of the kind unknown."""
-    real = os.path.realpath(path)
-    name = Path(real).name
-    if real.startswith("/dev/pts/"):
-        return Port(path, "pty")
-    timer = system / "sys/bus/usb-serial/devices" / name / "latency_timer"
-    return Port(
-        path,
-        _kind(name, system),
-        timer if timer.exists() else None,
-        _lasting_name(path, name, system) if name.startswith(("ttyUSB", "ttyACM")) else None,
-    )
+class UdpPorts(Protocol):
+    """The UDP ports of one device as drivers use them, see UdpLink."""
+
+    address: str | None
+    foreign: int
+    kernel_drops: int
+    receive_buffer_bytes: int
+
+    def read(self, timeout_s: float) -> list[Chunk]:
+        """What has come on all ports, in order of arrival; empty after `timeout_s`. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Close all ports."""
 
 
-def _kind(name: str, system: Path) -> Literal["uart", "cdc", "unknown"]:
-    driver = os.path.realpath(system / "sys/class/tty" / name / "device/driver")
-    if name.startswith("ttyACM") or driver.endswith("/cdc_acm"):
-        return "cdc"
-    if name.startswith(("ttyUSB", "ttyS", "ttyAMA", "ttyTHS", "ttymxc", "ttySC", "ttyO")):
-        return "uart"
-    return "unknown"
+class Links(Protocol):
+    """What a driver reaches the world through: links to its device, and the time on whose clock arrivals are."""
 
+    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
+        """Open a serial port. Raises DeviceError."""
 
-def _lasting_name(path: str, name: str, system: Path) -> str | None:
-    """A name by the serial number of the device, else by the socket it is plugged into."""
-    for folder in ("dev/serial/by-id", "dev/serial/by-path"):
-        if path.startswith(f"/{folder}/"):
-            return None
-        with contextlib.suppress(OSError):
-            for link in sorted((system / folder).iterdir()):
-                if Path(os.path.realpath(link)).name == name:
-                    return f"/{folder}/{link.name}"
-    return None
+    def udp(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address (None: the first heard). Raises DeviceError."""
+
+    def monotonic_ns(self) -> int:
+        """The time now, on the clock of arrivals."""
+
+    def utc_ns(self) -> int:
+        """UTC now, in nanoseconds since 1970."""
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass."""

@@ -17,9 +17,9 @@ from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, StreamSpec
 from drivers.links import LIVE, SILENCE_S, CountsBadInput, GarbageWatch, Links, SerialPort
-from drivers.ports import BITS_PER_BYTE
 from drivers.recognise import describe
 from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample
+from drivers.serial_ports import BITS_PER_BYTE
 
 ANSWER_S = 0.5
 TRIES = 3

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.ports import find_port
+from drivers.serial_ports import find_port
 
 
 def make_adapter(system: Path, name: str, driver: str, timer: str | None = None) -> None:
