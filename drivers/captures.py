@@ -237,13 +237,13 @@ class CaptureLinks:
         self._end_ns: int | None = None
         self._count = 0
 
-    def serial(self, port: str, baud: int) -> SerialPort:
+    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
         """The serial line of the capture, from its next chunk on. Raises DeviceError when it is over."""
         self._skip_handshake()
         self._jump(_is_serial)
         return CaptureSerialPort(self)
 
-    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
+    def udp(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
         """Datagrams to these ports, from the next one on. Raises DeviceError when it is over."""
         if not self.capture.has_arrivals:
             raise DeviceError(f"{self.capture.path}: is no pcap or pcapng, and this device sends datagrams")
@@ -341,6 +341,9 @@ def _is_serial(chunk: Chunk) -> bool:
 class CaptureSerialPort:
     """A serial line in a capture. What was sent to the device is passed over."""
 
+    byte_time_ns = 0.0
+    events: tuple[DeviceEvent, ...] = ()
+
     def __init__(self, links: CaptureLinks) -> None:
         self._links = links
 
@@ -370,7 +373,7 @@ class CaptureUdpPorts:
     kernel_drops = 0
     receive_buffer_bytes = 1 << 40
 
-    def __init__(self, links: CaptureLinks, address: str, ports: tuple[int, ...], source_port: int = 0) -> None:
+    def __init__(self, links: CaptureLinks, address: str | None, ports: tuple[int, ...], source_port: int = 0) -> None:
         self.address = address
         self.source_port = source_port
         self.foreign = 0
@@ -381,6 +384,8 @@ class CaptureUdpPorts:
         """Whether a datagram is of this device; counts strangers."""
         if chunk.source is None or chunk.destination is None or chunk.destination[1] not in self._ports:
             return False
+        if self.address is None:
+            self.address = chunk.source[0]
         if chunk.source[0] != self.address or self.source_port not in (0, chunk.source[1]):
             self.foreign += 1
             return False

@@ -12,8 +12,13 @@ BURST_MAX_NS = 10_000_000_000
 class CountsBadInput(Protocol):
     """A decoder: it counts what it could not use."""
 
-    bad_frames: int
-    skipped_bytes: int
+    @property
+    def bad_frames(self) -> int:
+        """Candidates for a frame that were none."""
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes outside of frames."""
 
 
 @dataclass(slots=True)

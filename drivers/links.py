@@ -28,7 +28,8 @@ import serial
 from drivers.device import DeviceError
 from drivers.garbage import CountsBadInput, GarbageWatch
 from drivers.ports import Links, SerialPort, UdpOptions, UdpPorts
-from drivers.samples import Chunk
+from drivers.samples import Chunk, DeviceEvent
+from drivers.serial_ports import find_port
 from drivers.udp_batches import SLOTS, BatchReceiver
 
 __all__ = [
@@ -62,17 +63,30 @@ _UINT32 = struct.Struct("@I")
 
 
 class SerialLink:
-    """An exclusively opened serial port (or pty), read without waiting for more than has come."""
+    """An exclusively opened serial port (or pty), read without waiting for more than has come.
 
-    def __init__(self, port: str, baud: int) -> None:
-        """Open `port` raw, 8N1. Raises DeviceError when it is absent, taken or not allowed."""
+    byte_time_ns: how long a byte takes on the wire, 0 where bytes do not come one by one. events: what the user must
+    know of the port.
+    """
+
+    def __init__(self, port: str, baud: int, *, keep_dtr: bool = False) -> None:
+        """Open `port` raw, 8N1. Raises DeviceError when it is absent, taken or not allowed.
+
+        keep_dtr: leave the line DTR as it is, also at the end; boards that are reset by it then go on running.
+        """
         self.port = port
         try:
-            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True)
+            self._serial = serial.Serial(port, baud, timeout=0, exclusive=True, dsrdtr=keep_dtr)
         except (OSError, ValueError, OverflowError, termios.error) as error:
             raise DeviceError(f"{port}: cannot open at {baud} baud: {_reason(error)}{_advice(error)}") from error
+        if keep_dtr:
+            self._stay_connected()
         with contextlib.suppress(OSError, ValueError):  # an FTDI adapter holds bytes back for 16 ms otherwise
             self._serial.set_low_latency_mode(True)
+        known = find_port(port)
+        self.byte_time_ns = known.byte_time_ns(baud)
+        texts = (("warning", known.shorten_latency()), ("info", known.advice()))
+        self.events = tuple(DeviceEvent(kind, text) for kind, text in texts if text)  # type: ignore[arg-type]
         # poll, not select: a process with many files has descriptors that select does not take.
         self._readable = select.poll()
         self._readable.register(self._serial.fileno(), select.POLLIN)
@@ -95,6 +109,13 @@ class SerialLink:
         if not data and events[0][1] & (select.POLLHUP | select.POLLERR):
             raise DeviceError(f"{self.port}: device is gone (hang-up)")
         return arrival_ns, data
+
+    def _stay_connected(self) -> None:
+        """Let the last close not drop DTR; without this the next open would be a pulse again."""
+        with contextlib.suppress(OSError, termios.error):
+            attributes = termios.tcgetattr(self._serial.fileno())
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, attributes)
 
     def discard_input(self) -> None:
         """Throw away what waits unread. Raises DeviceError."""
@@ -131,7 +152,7 @@ class UdpLink:
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
-    def __init__(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> None:
+    def __init__(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> None:
         """Bind the ports. Raises DeviceError when one is taken or an address is not an IPv4 address."""
         options = options or UdpOptions()
         self.address = address
@@ -151,7 +172,11 @@ class UdpLink:
         member = b""
         if options.multicast_group:
             member = _packed_ipv4(options.multicast_group) + _packed_ipv4(options.interface or "0.0.0.0")
-        bind_address = "127.0.0.1" if _packed_ipv4(address)[0] == 127 and not options.multicast_group else "0.0.0.0"
+        bind_address = (
+            "127.0.0.1"
+            if _packed_ipv4("0.0.0.0" if address is None else address)[0] == 127 and not options.multicast_group
+            else "0.0.0.0"
+        )
         self._buffer = bytearray(DATAGRAM_BYTES)
         for port in ports:
             udp = self._share(bind_address, port) if options.shared else self._bind(bind_address, port)
@@ -184,7 +209,9 @@ class UdpLink:
                 raise DeviceError(f"multicast group {options.multicast_group}{where}: {_reason(error)}") from error
 
     def accepts(self, source: tuple[str, int]) -> bool:
-        """Whether a datagram from there is of this link's device."""
+        """Whether a datagram from there is of this link's device; the first one tells, where no address is given."""
+        if self.address is None:
+            self.address = source[0]
         return source[0] == self.address and self.source_port in (0, source[1])
 
     def _bind(self, bind_address: str, port: int) -> socket.socket:
@@ -366,11 +393,11 @@ def _packed_ipv4(address: str) -> bytes:
 class LiveLinks:
     """Real devices and real time."""
 
-    def serial(self, port: str, baud: int) -> SerialPort:
+    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
         """Open a serial port. Raises DeviceError."""
-        return SerialLink(port, baud)
+        return SerialLink(port, baud, keep_dtr=keep_dtr)
 
-    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
+    def udp(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
         """Open UDP ports for the datagrams of one address. Raises DeviceError."""
         return UdpLink(address, ports, options)
 

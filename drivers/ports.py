@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.samples import Chunk
+from drivers.samples import Chunk, DeviceEvent
 
 
 class SerialPort(Protocol):
-    """A serial line as drivers use it, see SerialLink."""
+    """A serial line, or another stream of bytes to and from a device, as drivers use it; see SerialLink."""
+
+    byte_time_ns: float
+    events: tuple[DeviceEvent, ...]
 
     def read(self, timeout_s: float) -> tuple[int, bytes]:
         """Arrival and bytes of what has come, (now, b"") when nothing did. Raises DeviceError."""
@@ -40,7 +43,7 @@ class UdpOptions:
 class UdpPorts(Protocol):
     """The UDP ports of one device as drivers use them, see UdpLink."""
 
-    address: str
+    address: str | None
     foreign: int
     kernel_drops: int
     receive_buffer_bytes: int
@@ -55,11 +58,11 @@ class UdpPorts(Protocol):
 class Links(Protocol):
     """What a driver reaches the world through: links to its device, and the time on whose clock arrivals are."""
 
-    def serial(self, port: str, baud: int) -> SerialPort:
+    def serial(self, port: str, baud: int, *, keep_dtr: bool = False) -> SerialPort:
         """Open a serial port. Raises DeviceError."""
 
-    def udp(self, address: str, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
-        """Open UDP ports for the datagrams of one address. Raises DeviceError."""
+    def udp(self, address: str | None, ports: tuple[int, ...], options: UdpOptions | None = None) -> UdpPorts:
+        """Open UDP ports for the datagrams of one address (None: the first heard). Raises DeviceError."""
 
     def monotonic_ns(self) -> int:
         """The time now, on the clock of arrivals."""

@@ -1,84 +1,120 @@
-"""Which protocol speaks on a port, by a sample of its bytes."""
+"""Which protocol speaks on a port, by a sample of its bytes.
 
-import binascii
+A protocol is recognised when enough of its frames have good checksums and they make up a fair share of the bytes; lines
+of numbers, which have no checksum, when they agree on the number of columns.
+"""
+
 import re
-from collections.abc import Callable, Iterator
-from functools import reduce
+from collections import Counter
+from collections.abc import Callable
 
-ENOUGH_FRAMES = 2
-MIN_COLUMNS = 4
-_SENTENCE = re.compile(rb"\$([A-Z]{2}[A-Z0-9]{3}[,A-Za-z0-9.+-]*)\*([0-9A-Fa-f]{2})\r?\n")
-_NUMBERS = re.compile(rb"[^0-9+\-.]*((?:[+-]?[0-9.]+[,;\t ]+)+[+-]?[0-9.]+)[^0-9]*\r?")
+from drivers.gnss.nmea_scanner import SentenceScanner
+from drivers.imu.ascii_decoder import MAX_LINE_BYTES
+from drivers.imu.mip_decoder import MipDecoder
+from drivers.imu.mtdata2 import XbusFramer
+from drivers.imu.rvc_decoder import FRAME_BYTES as RVC_BYTES
+from drivers.imu.rvc_decoder import RvcDecoder
+from drivers.imu.vectornav_decoder import VectornavDecoder
+from drivers.imu.witmotion_decoder import FRAME_BYTES as WITMOTION_BYTES
+from drivers.imu.witmotion_decoder import WitmotionDecoder
+
+MIN_FRAMES = 2
+MIN_FRAMES_OF_WEAK_CHECKSUM = 4  # one byte: every 256th false start passes
+MIN_SHARE = 0.3
+MIN_LINES = 3
+MIN_COLUMNS = 3
+MAX_DATA_BYTES = 65536
+
+_NUMBER = rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_NUMBER_LINE = re.compile(
+    rb"[A-Za-z#$=:_]{0,12}[ \t]*" + _NUMBER + rb"(?:[,;\t ]+" + _NUMBER + rb")+(?:\*[0-9A-Fa-f]{2})?"
+)
+_SEPARATORS = re.compile(rb"[,;\t ]+")
+
+Finding = tuple[float, str, str]
+"""Share of the bytes that are explained, driver, evidence."""
 
 
 def recognise(data: bytes) -> list[tuple[str, str]]:
-    """(driver, evidence) for all drivers that understand it, the likeliest first."""
-    found = list(_by_sentence(data))
-    for driver, name, frames in (
-        ("xsens", "XBus messages", _sized(data, b"\xfa\xff", 3, 5, lambda frame: sum(frame[1:]) & 0xFF == 0)),
-        ("microstrain", "MIP packets", _sized(data, b"\x75\x65", 3, 6, _fletcher_holds)),
-        ("bno08x-rvc", "RVC frames", _fixed(data, b"\xaa\xaa", 19, 2)),
-        ("witmotion", "WIT frames", _fixed(data, b"\x55", 11, 0)),
-        ("vectornav", "VectorNav messages", _vectornav(data)),
-    ):
-        if frames >= ENOUGH_FRAMES:
-            found.append((driver, f"{frames} {name}"))
-    if not found and _number_lines(data):
-        found.append(("ascii-imu", "lines of numbers"))
+    """(driver, evidence) for all drivers that understand these bytes, the likeliest first."""
+    data = data[:MAX_DATA_BYTES]
+    findings = [finding for look in _LOOKS if data and (finding := look(data)) is not None]
+    findings.sort(reverse=True)
+    return [(driver, evidence) for _, driver, evidence in findings]
+
+
+def describe(data: bytes) -> str:
+    """An addition to a message on bytes that are not understood; empty when nothing is recognised."""
+    return "".join(f"; it looks like {evidence} (driver {driver})" for driver, evidence in recognise(data)[:1])
+
+
+def _finding(driver: str, what: str, frames: int, needed: int, explained: int, data: bytes) -> Finding | None:
+    share = explained / len(data)
+    if frames < needed or share < MIN_SHARE:
+        return None
+    return share, driver, f"{what}: {frames} with a good checksum, {share:.0%} of {len(data)} bytes"
+
+
+def _xsens(data: bytes) -> Finding | None:
+    framer = XbusFramer()
+    frames = framer.feed(data)
+    explained = sum(len(payload) + 5 for _, payload in frames)
+    return _finding("xsens", "Xsens XBus frames", len(frames), MIN_FRAMES, explained, data)
+
+
+def _vectornav(data: bytes) -> Finding | None:
+    frames = VectornavDecoder().framer.feed(data)
+    explained = sum(len(frame) for _, frame in frames)
+    return _finding("vectornav", "VectorNav frames", len(frames), MIN_FRAMES, explained, data)
+
+
+def _microstrain(data: bytes) -> Finding | None:
+    frames = MipDecoder().framer.feed(data)
+    explained = sum(len(frame) for _, frame in frames)
+    return _finding("microstrain", "MicroStrain MIP packets", len(frames), MIN_FRAMES, explained, data)
+
+
+def _witmotion(data: bytes) -> Finding | None:
+    count = len(WitmotionDecoder().framer.feed(data))
+    return _finding("witmotion", "WitMotion frames", count, MIN_FRAMES_OF_WEAK_CHECKSUM, count * WITMOTION_BYTES, data)
+
+
+def _rvc(data: bytes) -> Finding | None:
+    count = len(RvcDecoder().framer.feed(data))
+    return _finding("bno08x-rvc", "BNO08x-RVC frames", count, MIN_FRAMES, count * RVC_BYTES, data)
+
+
+def _nmea(data: bytes) -> Finding | None:
+    scanner = SentenceScanner()
+    sentences = [body for _, body in scanner.feed(data) if not body.startswith(b"VN")]
+    explained = sum(len(body) + 6 for body in sentences)
+    found = _finding("nmea", "NMEA sentences", len(sentences), MIN_FRAMES, explained, data)
+    if found is None and len(sentences) >= MIN_FRAMES and scanner.skipped_bytes < MIN_SHARE * len(data):
+        share = 1 - scanner.skipped_bytes / len(data)  # the rest is whole UBX or RTCM messages
+        return share, "nmea", f"NMEA sentences between binary messages: {len(sentences)} with a good checksum"
     return found
 
 
-def _by_sentence(data: bytes) -> Iterator[tuple[str, str]]:
-    for body, checksum in _SENTENCE.findall(data):
-        if reduce(lambda total, byte: total ^ byte, body, 0) == int(checksum, 16):
-            driver = "vectornav" if body.startswith(b"VN") else "nmea"
-            yield driver, f"a sentence ${body[:5].decode()}"
-            return
+def _ascii_imu(data: bytes) -> Finding | None:
+    """Lines of numbers with one number of columns; the first and the last are cut."""
+    lines = [line.strip() for line in data.split(b"\n")[1:-1]]
+    numbers = [line for line in lines if len(line) <= MAX_LINE_BYTES and _NUMBER_LINE.fullmatch(line)]
+    if len(numbers) < MIN_LINES:
+        return None
+    ((columns, count),) = Counter(len(_SEPARATORS.split(line)) for line in numbers).most_common(1)
+    share = sum(len(line) + 2 for line in numbers) / len(data)
+    if columns < MIN_COLUMNS or count < 0.8 * len(lines) or share < MIN_SHARE:
+        return None
+    example = numbers[-1].decode("ascii", "replace")
+    return share / 2, "ascii-imu", f"lines of {columns} numbers: {count} of {len(lines)}, like {example!r}"
 
 
-def _sized(data: bytes, sync: bytes, length_at: int, overhead: int, holds: Callable[[bytes], bool]) -> int:
-    frames, start = 0, data.find(sync)
-    while 0 <= start < len(data) - length_at:
-        frame = data[start : start + overhead + data[start + length_at]]
-        whole = len(frame) == overhead + data[start + length_at] and holds(frame)
-        frames += whole
-        start = data.find(sync, start + (len(frame) if whole else 1))
-    return frames
-
-
-def _fletcher_holds(frame: bytes) -> bool:
-    first = second = 0
-    for byte in frame[:-2]:
-        first = first + byte & 0xFF
-        second = second + first & 0xFF
-    return frame[-2:] == bytes((first, second))
-
-
-def _fixed(data: bytes, sync: bytes, size: int, sum_from: int) -> int:
-    """Frames of one size that end with the sum of their bytes."""
-    frames, start = 0, data.find(sync)
-    while 0 <= start <= len(data) - size:
-        frame = data[start : start + size]
-        whole = sum(frame[sum_from:-1]) & 0xFF == frame[-1] and any(frame[1:])
-        if sync == b"\x55":
-            whole = whole and 0x50 <= frame[1] <= 0x5F
-        frames += whole
-        start = data.find(sync, start + (size if whole else 1))
-    return frames
-
-
-def _vectornav(data: bytes) -> int:
-    """Binary frames have no length: from one sync to another the CRC must hold."""
-    places = [place for place in range(len(data)) if data[place] == 0xFA][:64]
-    frames = 0
-    for start in places:
-        ends = [end for end in places if start + 12 <= end <= start + 600]
-        frames += any(binascii.crc_hqx(data[start + 1 : end], 0) == 0 for end in ends)
-    return frames
-
-
-def _number_lines(data: bytes) -> bool:
-    """Three lines after each other with equally many numbers; the first and last may be cut."""
-    lines = data.split(b"\n")[1:-1][-3:]
-    counts = {len(re.split(rb"[,;\t ]+", match[1])) if (match := _NUMBERS.fullmatch(line)) else 0 for line in lines}
-    return len(lines) == 3 and len(counts) == 1 and min(counts) >= MIN_COLUMNS
+_LOOKS: tuple[Callable[[bytes], Finding | None], ...] = (
+    _xsens,
+    _vectornav,
+    _microstrain,
+    _witmotion,
+    _rvc,
+    _nmea,
+    _ascii_imu,
+)

@@ -43,7 +43,8 @@ class FixSample:
     device_ticks: UTC of the epoch in nanoseconds since 1970.
     stream_offset: how many bytes the decoder had been fed before the epoch's first byte (its arrival is the
     arrival of that byte).
-    altitude_m: above mean sea level; undulation_m: geoid above the ellipsoid, None where not sent.
+    altitude_m: above mean sea level, or as configured above the ellipsoid.
+    undulation_m: geoid above the ellipsoid, None where not sent.
     accuracy_m, vertical_accuracy_m: one sigma, horizontal hypot(lat, lon); accuracy_source tells the rule.
     """
 

@@ -130,8 +130,9 @@ def _device(path: Path, driver: str, settings: tuple[str, ...], tape: _Tape | No
     if "address" in fields:
         ports = [entry.get(key, field.default) for key, field in fields.items() if key in PORT_KEYS]
         entry["address"] = entry.get("address") or _address(path, ports)
-    elif "port" in fields:
+    elif "port" in fields and not entry.get("udp"):
         entry["port"] = str(path)
+        entry.pop("tcp", None)  # a tape of a connection is one of bytes, like that of a port
     text = yaml.safe_dump({"devices": {path.stem if tape else driver: entry}})
     return parse_rig(text, "decode", path.parent).devices[0]
 

@@ -7,20 +7,20 @@ position from GGA, accuracy from GST, date from RMC or ZDA.
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from itertools import accumulate
+from functools import lru_cache
 from typing import Literal
 
+from drivers.gnss.nmea_scanner import SentenceScanner
 from drivers.samples import FixSample
 
-MAX_SENTENCE_BYTES = 512  # the standard says 82; high-precision receivers do not keep to it
-MAX_UBX_PAYLOAD_BYTES = 4096
 EMITTED_QUALITIES = frozenset((1, 2, 3, 4, 5, 9))  # not: none, dead reckoning, manual, simulator
 QUALITY_OF_RMC_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
-QUALITY_RANK = (4, 5, 9, 3, 2, 1)  # best first
-UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 9: 2.5}
+QUALITY_RANK = (4, 5, 9, 3, 2, 1, 6, 8, 7)  # best first
+QUALITY_OF_GNS_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
+UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 6: 20.0, 9: 2.5}
 """Horizontal error, one sigma, for a dilution of 1, by quality: rough, from what receivers with GST say."""
 VERTICAL_PER_HORIZONTAL = 2.0
 MAX_HDOP = 99.0  # receivers send 99.9 for "unknown"
@@ -29,136 +29,27 @@ NS_PER_S = 1_000_000_000
 DAY_NS = 86_400 * NS_PER_S
 ROLLOVER_NS = 1024 * 7 * DAY_NS
 
-_START = re.compile(rb"[$!\xb5\xd3]")
-_BODY = re.compile(rb"[\x20-\x23\x25-\x29\x2b-\x7e]*")  # printable, neither $ nor *
-_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
 _COORDINATE = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
 
-TIME_FIELD = {"GGA": 1, "RMC": 1, "GST": 1, "ZDA": 1, "GNS": 1, "GBS": 1, "GRS": 1, "GLL": 5}
+TIME_FIELD = {b"GGA": 1, b"RMC": 1, b"GST": 1, b"ZDA": 1, b"GNS": 1, b"GBS": 1, b"GRS": 1, b"GLL": 5}
 Source = Literal["gst", "dop", "none"]
 
 
 @dataclass(frozen=True, slots=True)
-class Sentence:
-    """A sentence with a good checksum; offset: of its first byte in the stream. fields[0] is the address (GPGGA)."""
+class FixRules:
+    """Which epochs become fixes, and how their numbers are made.
 
-    offset: int
-    fields: list[str]
-
-
-@dataclass(slots=True)
-class SentenceScanner:
-    """Finds sentences in any mixture of NMEA and binary; whole UBX and RTCM 3 messages are stepped over.
-
-    bad_frames: sentences with a wrong or no checksum, or cut. skipped_bytes: bytes that belong to nothing known.
+    qualities: those to take (6 dead reckoning, 7 manual, 8 simulator are not by default). is_ellipsoidal: altitude
+    above the ellipsoid instead of mean sea level, None where the undulation is not sent. uere_m: horizontal error, one
+    sigma, for a dilution of 1, by quality; a quality that is not in it has no accuracy without GST.
     """
 
-    bad_frames: int = 0
-    skipped_bytes: int = 0
-    _buffer: bytearray = field(default_factory=bytearray)
-    _buffer_offset: int = 0
-
-    def feed(self, data: bytes) -> list[Sentence]:
-        """The sentences that `data` completes, AIS and proprietary ones included."""
-        self._buffer += data
-        sentences: list[Sentence] = []
-        position = 0
-        while match := _START.search(self._buffer, position):
-            self._skip(position, match.start())
-            position = match.start()
-            length = self._length(position)
-            if length is None:
-                break
-            if length == 0:  # no message begins here
-                self._skip(position, position + 1)
-                position += 1
-                continue
-            if self._buffer[position] == ord("$"):
-                body = self._buffer[position + 1 : position + length - 3]
-                sentences.append(Sentence(self._buffer_offset + position, body.decode("ascii").split(",")))
-            position += length
-        else:
-            self._skip(position, len(self._buffer))
-            position = len(self._buffer)
-        del self._buffer[:position]
-        self._buffer_offset += position
-        return sentences
-
-    def _skip(self, start: int, end: int) -> None:
-        gap = self._buffer[start:end]
-        self.skipped_bytes += len(gap) - gap.count(b"\r") - gap.count(b"\n")  # line ends are no garbage
-
-    def _length(self, position: int) -> int | None:
-        """Bytes of the message at `position`; 0 when there is none, None while that cannot be told."""
-        first = self._buffer[position]
-        if first == 0xB5:
-            return _ubx_length(self._buffer, position)
-        if first == 0xD3:
-            return _rtcm_length(self._buffer, position)
-        length = _sentence_length(self._buffer, position)
-        if length == 0:
-            self.bad_frames += 1
-        return length
-
-
-def _sentence_length(buffer: bytearray, position: int) -> int | None:
-    end = _BODY.match(buffer, position + 1, position + MAX_SENTENCE_BYTES).end()  # type: ignore[union-attr]
-    if end >= position + MAX_SENTENCE_BYTES:
-        return 0
-    if end == len(buffer) or (buffer[end] == ord("*") and len(buffer) < end + 3):
-        return None
-    if not _CHECKSUM.match(buffer, end):
-        return 0
-    checksum = 0
-    for byte in buffer[position + 1 : end]:
-        checksum ^= byte
-    return end + 3 - position if checksum == int(buffer[end + 1 : end + 3], 16) else 0
-
-
-def _ubx_length(buffer: bytearray, position: int) -> int | None:
-    available = len(buffer) - position
-    if available >= 2 and buffer[position + 1] != 0x62:
-        return 0
-    if available < 6:
-        return None
-    size = int.from_bytes(buffer[position + 4 : position + 6], "little")
-    if size > MAX_UBX_PAYLOAD_BYTES:
-        return 0
-    if available < size + 8:
-        return None
-    sums = list(accumulate(buffer[position + 2 : position + size + 6]))
-    checksum = bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
-    return size + 8 if buffer[position + size + 6 : position + size + 8] == checksum else 0
-
-
-def _rtcm_length(buffer: bytearray, position: int) -> int | None:
-    available = len(buffer) - position
-    if available >= 2 and buffer[position + 1] & 0xFC:  # six reserved bits
-        return 0
-    if available < 3:
-        return None
-    size = (buffer[position + 1] & 0x03) << 8 | buffer[position + 2]
-    if available < size + 6:
-        return None
-    crc = 0
-    for byte in buffer[position : position + size + 3]:
-        crc = (crc << 8 & 0xFFFFFF) ^ _CRC24Q[crc >> 16 ^ byte]
-    return size + 6 if crc == int.from_bytes(buffer[position + size + 3 : position + size + 6]) else 0
-
-
-def _crc24q_table() -> list[int]:
-    table = []
-    for byte in range(256):
-        crc = byte << 16
-        for _ in range(8):
-            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
-        table.append(crc & 0xFFFFFF)
-    return table
-
-
-_CRC24Q = _crc24q_table()
+    qualities: frozenset[int] = EMITTED_QUALITIES
+    is_ellipsoidal: bool = False
+    uere_m: Mapping[int, float] = field(default_factory=lambda: UERE_M)
+    vertical_per_horizontal: float = VERTICAL_PER_HORIZONTAL
 
 
 @dataclass(slots=True)
@@ -174,6 +65,14 @@ class _Position:
     satellites: int | None = None
     hdop: float | None = None
     correction_age_s: float | None = None
+    decimals: int = 0
+
+    @property
+    def ellipsoidal_m(self) -> float | None:
+        """Altitude above the ellipsoid."""
+        if self.altitude_m is None or self.undulation_m is None:
+            return None
+        return self.altitude_m + self.undulation_m
 
     def is_better_than(self, other: "_Position | None") -> bool:
         if other is None:
@@ -194,7 +93,8 @@ class _Epoch:
     offset: int
     gga: _Position | None = None
     is_refused: bool = False
-    rmc: _Position | None = None
+    rmc: list[str] | None = None
+    gns: _Position | None = None
     date_ns: int | None = None
     sigmas_m: tuple[float, float | None] | None = None
     seen: dict[str, int] = field(default_factory=dict)
@@ -212,16 +112,21 @@ class NmeaDecoder:
     completes dates and undoes jumps of 1024 weeks. `feed` gives a fix as soon as its epoch is known to be over: at the
     sentence that has ended the epochs before, else at the first of the next epoch. `flush` is for the pause between.
     sentences: how many came. rollovers: by how many times 1024 weeks the receiver's date was off, the last time.
+    decimals: of the minutes of the last position given out.
     """
 
     reference_utc_ns: int
+    rules: FixRules = field(default_factory=FixRules)
     sentences: int = 0
+    decimals: int = 0
     rollovers: int = 0
     scanner: SentenceScanner = field(default_factory=SentenceScanner)
     _epoch: _Epoch | None = None
     _last_utc_ns: int | None = None
     _ender: tuple[str, int] | None = None
     _previous_tail: tuple[str, int] | None = None
+    _time_text: str | None = None
+    _time_ns: int | None = None
 
     @property
     def bad_frames(self) -> int:
@@ -236,9 +141,11 @@ class NmeaDecoder:
     def feed(self, data: bytes) -> list[FixSample]:
         """The fixes that `data` completes."""
         fixes: list[FixSample] = []
-        for sentence in self.scanner.feed(data):
-            self.sentences += 1
-            self._take(sentence, fixes)
+        sentences = self.scanner.feed(data)
+        self.sentences += len(sentences)
+        for offset, body in sentences:
+            if (place := TIME_FIELD.get(body[2:5])) is not None and body[5:6] == b",":
+                self._take(offset, body, place, fixes)
         return fixes
 
     def flush(self) -> list[FixSample]:
@@ -247,22 +154,27 @@ class NmeaDecoder:
         self._close(fixes)
         return fixes
 
-    def _take(self, sentence: Sentence, fixes: list[FixSample]) -> None:
-        address = sentence.fields[0]
-        kind = address[2:]
-        if len(address) != 5 or (place := TIME_FIELD.get(kind)) is None or place >= len(sentence.fields):
+    def _take(self, offset: int, body: bytes, place: int, fixes: list[FixSample]) -> None:
+        """A sentence with the time in the field at `place`."""
+        fields = body.decode("ascii").split(",")
+        if place >= len(fields):
             return
-        day_ns = _time_of_day_ns(sentence.fields[place])
+        if fields[place] != self._time_text:
+            self._time_text = fields[place]
+            self._time_ns = _time_of_day_ns(self._time_text)
+        day_ns = self._time_ns
         if day_ns is None:
             return
         if self._epoch is None or self._epoch.day_ns != day_ns:
             self._close(fixes)
             self._learn()
-            self._epoch = _Epoch(day_ns, sentence.offset)
-        if (gather := _GATHER.get(kind)) is not None:
-            gather(self._epoch, sentence.fields)
-            if kind != "ZDA":  # it brings a date only, often once a second: it must neither end nor spoil an epoch
-                self._mark(address, fixes)
+            self._epoch = _Epoch(day_ns, offset)
+        if (gather := _GATHER.get(body[2:5])) is not None:
+            gather(self._epoch, fields, self.rules)
+            if (
+                gather is not _gather_zda
+            ):  # it brings a date only, often once a second: it must neither end nor spoil an epoch
+                self._mark(fields[0], fixes)
 
     def _mark(self, address: str, fixes: list[FixSample]) -> None:
         """Note that a sentence of the fix has come, and close the epoch when it is the one that ends the cycle."""
@@ -295,17 +207,18 @@ class NmeaDecoder:
         if epoch is None or epoch.is_over:
             return
         epoch.is_over = True
-        position = epoch.gga or (None if epoch.is_refused else epoch.rmc)
-        if position is None or position.quality not in EMITTED_QUALITIES:
+        position = epoch.gga or (None if epoch.is_refused else epoch.gns or _position_of_rmc(epoch.rmc))
+        if position is None or position.quality not in self.rules.qualities:
             return
         epoch.has_fix = True
-        accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m)
+        self.decimals = position.decimals
+        accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m, self.rules)
         fix = FixSample(
             device_ticks=self._utc_ns(epoch),
             stream_offset=epoch.offset,
             latitude_deg=position.latitude_deg,
             longitude_deg=position.longitude_deg,
-            altitude_m=position.altitude_m,
+            altitude_m=position.ellipsoidal_m if self.rules.is_ellipsoidal else position.altitude_m,
             undulation_m=position.undulation_m,
             accuracy_m=accuracy_m,
             vertical_accuracy_m=vertical_accuracy_m,
@@ -328,11 +241,11 @@ class NmeaDecoder:
         return epoch.day_ns + _rounded(near_ns - epoch.day_ns, DAY_NS) * DAY_NS
 
 
-def _gather_gga(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_gga(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     quality = _integer(fields[6]) if len(fields) >= 12 else None
     if quality is None:  # receivers that leave it empty say with RMC whether the position is good
         return
-    if quality not in EMITTED_QUALITIES:
+    if quality not in rules.qualities:
         epoch.is_refused = True
         return
     latitude_deg, longitude_deg = _coordinates(fields[2:6])
@@ -348,22 +261,56 @@ def _gather_gga(epoch: _Epoch, fields: list[str]) -> None:
         satellites=_integer(fields[7]),
         hdop=_number(fields[8], 0, MAX_HDOP),
         correction_age_s=_number(fields[13], 0, 1e6) if len(fields) > 13 else None,
+        decimals=_decimals(fields[2]),
     )
     if position.is_better_than(epoch.gga):
         epoch.gga = position
 
 
-def _gather_rmc(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_rmc(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) < 10 or fields[2] != "A":  # a void sentence may carry any date
         return
     epoch.date_ns = _date_ns(fields[9][:2], fields[9][2:4], fields[9][4:])
+    if fields[3] and fields[5]:
+        epoch.rmc = fields
+
+
+def _position_of_rmc(fields: list[str] | None) -> _Position | None:
+    """Made only where there is no better sentence."""
+    if fields is None:
+        return None
     quality = QUALITY_OF_RMC_MODE.get(fields[12], 0) if len(fields) > 12 else 1
     latitude_deg, longitude_deg = _coordinates(fields[3:7])
-    if latitude_deg is not None and longitude_deg is not None:
-        epoch.rmc = _Position(fields[0].startswith("GN"), quality, latitude_deg, longitude_deg)
+    if latitude_deg is None or longitude_deg is None:
+        return None
+    return _Position(fields[0].startswith("GN"), quality, latitude_deg, longitude_deg, decimals=_decimals(fields[3]))
 
 
-def _gather_gst(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_gns(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
+    """One mode letter for each satellite system; the position is as good as the best of them."""
+    if len(fields) < 11:
+        return
+    qualities = [QUALITY_OF_GNS_MODE[letter] for letter in fields[6] if letter in QUALITY_OF_GNS_MODE]
+    latitude_deg, longitude_deg = _coordinates(fields[2:6])
+    if not qualities or latitude_deg is None or longitude_deg is None:
+        return
+    position = _Position(
+        is_multi_system=fields[0].startswith("GN"),
+        quality=min(qualities, key=QUALITY_RANK.index),
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=_number(fields[9], -2_000, 100_000),
+        undulation_m=_number(fields[10], -200, 200),
+        satellites=_integer(fields[7]),
+        hdop=_number(fields[8], 0, MAX_HDOP),
+        correction_age_s=_number(fields[11], 0, 1e6) if len(fields) > 11 else None,
+        decimals=_decimals(fields[2]),
+    )
+    if position.is_better_than(epoch.gns):
+        epoch.gns = position
+
+
+def _gather_gst(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) < 9:
         return
     latitude_m, longitude_m = _number(fields[6], 0, 1e6), _number(fields[7], 0, 1e6)
@@ -371,28 +318,29 @@ def _gather_gst(epoch: _Epoch, fields: list[str]) -> None:
         epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), _number(fields[8], 0, 1e6))
 
 
-def _gather_zda(epoch: _Epoch, fields: list[str]) -> None:
+def _gather_zda(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
     if len(fields) >= 5 and epoch.date_ns is None:
         epoch.date_ns = _date_ns(*fields[2:5])
 
 
-_GATHER: dict[str, Callable[[_Epoch, list[str]], None]] = {
-    "GGA": _gather_gga,
-    "RMC": _gather_rmc,
-    "GST": _gather_gst,
-    "ZDA": _gather_zda,
+_GATHER: dict[bytes, Callable[[_Epoch, list[str], FixRules], None]] = {
+    b"GGA": _gather_gga,
+    b"GNS": _gather_gns,
+    b"RMC": _gather_rmc,
+    b"GST": _gather_gst,
+    b"ZDA": _gather_zda,
 }
 
 
 def _accuracy(
-    position: _Position, sigmas_m: tuple[float, float | None] | None
+    position: _Position, sigmas_m: tuple[float, float | None] | None, rules: FixRules
 ) -> tuple[float | None, float | None, Source]:
     if sigmas_m is not None:
         return *sigmas_m, "gst"
-    if not position.hdop:
+    if not position.hdop or position.quality not in rules.uere_m:
         return None, None, "none"
-    accuracy_m = position.hdop * UERE_M[position.quality]
-    return accuracy_m, accuracy_m * VERTICAL_PER_HORIZONTAL, "dop"
+    accuracy_m = position.hdop * rules.uere_m[position.quality]
+    return accuracy_m, accuracy_m * rules.vertical_per_horizontal, "dop"
 
 
 def _number(text: str, low: float, high: float) -> float | None:
@@ -400,6 +348,10 @@ def _number(text: str, low: float, high: float) -> float | None:
         return None
     value = float(text)
     return value if low <= value <= high else None
+
+
+def _decimals(text: str) -> int:
+    return len(text.partition(".")[2])
 
 
 def _integer(text: str) -> int | None:
@@ -430,6 +382,7 @@ def _time_of_day_ns(text: str) -> int | None:
     return (hour * 3600 + minute * 60 + second) * NS_PER_S + int((match[4] or "")[:9].ljust(9, "0"))
 
 
+@lru_cache(maxsize=8)
 def _date_ns(day: str, month: str, year: str) -> int | None:
     if not (day.isdigit() and month.isdigit() and year.isdigit() and len(year) in (2, 4)):
         return None

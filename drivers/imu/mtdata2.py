@@ -45,16 +45,22 @@ class XbusFramer:
     """Cuts a byte stream into frames: `feed` accepts any split of it and gives (message id, payload) pairs.
 
     bad_frames: candidates that are no frame (checksum, length, broken items). skipped_bytes: bytes outside of frames.
+    starts: for each frame of the last `feed`, how many bytes had been fed before its first byte.
     """
 
     bad_frames: int = 0
     skipped_bytes: int = 0
+    starts: list[int] = field(default_factory=list)
+    _fed: int = 0
     _buffer: bytearray = field(default_factory=bytearray)
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that `data` completes."""
         self._buffer += data
+        self._fed += len(data)
+        buffer_offset = self._fed - len(self._buffer)
         frames: list[Frame] = []
+        self.starts = []
         position = 0
         while True:
             start = self._buffer.find(PREAMBLE, position)
@@ -73,6 +79,7 @@ class XbusFramer:
                 position += 1
                 continue
             frames.append(frame)
+            self.starts.append(buffer_offset + position)
             position = extent[1]
         del self._buffer[:position]
         return frames
@@ -113,12 +120,14 @@ class Mtdata2Decoder:
     magnetic_field_ut: strength of the local field in µT: the device's magnetometer unit is about one local field.
     lost_messages: holes in the packet counter, measurements without inertial data included.
     frames: how many frames came, of any kind. replies: the latest that are no measurement, for who cares to take them.
+    starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
     """
 
     magnetic_field_ut: float = 50.0
     lost_messages: int = 0
     frames: int = 0
     replies: deque[Frame] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
+    starts: list[int] = field(default_factory=list)
     framer: XbusFramer = field(default_factory=XbusFramer)
     _counter: int | None = None
     _ticks: int | None = None
@@ -135,13 +144,11 @@ class Mtdata2Decoder:
 
     def feed(self, data: bytes) -> list[ImuSample]:
         """The samples that `data` completes."""
-        return self.samples(self.framer.feed(data))
-
-    def samples(self, frames: list[Frame]) -> list[ImuSample]:
-        """The samples among frames which `framer` has cut already."""
+        frames = self.framer.feed(data)
         self.frames += len(frames)
         samples: list[ImuSample] = []
-        for message_id, payload in frames:
+        self.starts = []
+        for start, (message_id, payload) in zip(self.framer.starts, frames, strict=True):
             if message_id != MTDATA2:
                 self.replies.append((message_id, payload))
                 continue
@@ -150,6 +157,7 @@ class Mtdata2Decoder:
             # A packet without inertial data (GNSS) carries the time of an older moment: it must not reach a clock map.
             if sample.accel_m_s2 is not None or sample.gyro_rad_s is not None:
                 samples.append(sample)
+                self.starts.append(start)
         return samples
 
     def _count_lost(self, sample: ImuSample) -> None:

@@ -5,6 +5,7 @@ import os
 import pty
 import resource
 import socket
+import termios
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -424,3 +425,32 @@ def test_garbage_without_end_is_told_every_ten_seconds() -> None:
     assert sum(event.count for event in events) + 30 >= 300 - 100
     events += watch.events(second(31.1))
     assert sum(event.count for event in events) == 300
+
+
+@pytest.mark.parametrize("keep_dtr", [False, True])
+def test_dtr_is_kept_at_the_end_on_request(line: Pty, keep_dtr: bool) -> None:
+    link = SerialLink(line.port, BAUD, keep_dtr=keep_dtr)
+    control_flags = termios.tcgetattr(link._serial.fileno())[2]
+    assert not (keep_dtr and control_flags & termios.HUPCL)
+    link.close()
+
+
+def test_pty_sends_bytes_as_they_come(link: SerialLink) -> None:
+    assert (link.byte_time_ns, link.events) == (0.0, ())
+
+
+def test_datagrams_of_the_first_sender_when_none_is_given() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOCALHOST, 0))
+        port = probe.getsockname()[1]
+    link = UdpLink(None, (port,))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
+        first.bind((LOCALHOST, 0))
+        first.sendto(b"first", (LOCALHOST, port))
+        assert [chunk.data for chunk in link.read(PATIENCE_S)] == [b"first"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+        second.bind((STRANGER, 0))
+        second.sendto(b"second", (LOCALHOST, port))
+        assert link.read(PATIENCE_S) == []
+    assert (link.address, link.foreign) == (LOCALHOST, 1)
+    link.close()

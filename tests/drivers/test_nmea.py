@@ -1,15 +1,18 @@
 """NMEA decoder against gpsd's reading of real captures, and the driver over a pty."""
 
+import contextlib
 import json
 import os
+import socket
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import reduce
 from itertools import pairwise
 from operator import xor
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
+from time import sleep
 
 import pytest
 from hypothesis import example, given, settings
@@ -18,7 +21,8 @@ from hypothesis import strategies as st
 from drivers import links
 from drivers.device import DeviceError
 from drivers.gnss.nmea import DRIVER, NmeaConfig, NmeaDriver
-from drivers.gnss.nmea_decoder import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES, NmeaDecoder
+from drivers.gnss.nmea_decoder import FixRules, NmeaDecoder
+from drivers.gnss.nmea_scanner import MAX_SENTENCE_BYTES, MAX_UBX_PAYLOAD_BYTES
 from drivers.samples import Chunk, FixSample, Received
 
 DATA = Path(__file__).parent.parent / "data" / "nmea"
@@ -367,6 +371,9 @@ def test_absent_port_is_named() -> None:
 class ScriptedLink:
     """Reads come from a list of (arrival in milliseconds, bytes)."""
 
+    byte_time_ns = 0.0
+    events = ()
+
     def __init__(self, reads: list[tuple[int, bytes]]) -> None:
         self.reads = iter(reads)
 
@@ -381,7 +388,7 @@ class ScriptedLink:
 def scripted(
     monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], rate_hz: float = 10
 ) -> Iterator[Received]:
-    monkeypatch.setattr(links, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", rate_hz)
     driver.connect()
     assert [(stream.kind, stream.rate_hz) for stream in driver.streams] == [("gnss", rate_hz)]
@@ -430,3 +437,138 @@ def test_warnings_and_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "no NMEA sentence for 3 s" in events[0].text
     assert "1024 weeks" in events[1].text
     assert events[2].count == 5
+
+
+def decode_with(rules: FixRules, data: bytes) -> list[FixSample]:
+    decoder = NmeaDecoder(utc_ns(NOON), rules=rules)
+    return decoder.feed(data) + decoder.flush()
+
+
+def test_altitude_above_the_ellipsoid() -> None:
+    rules = FixRules(is_ellipsoidal=True)
+    assert [fix.altitude_m for fix in decode_with(rules, gga())] == [pytest.approx(32.1)]
+    no_undulation = sentence("GPGGA,120000.00,6010.428,N,02454.390,E,1,12,0.80,14.2,M,,M,,")
+    assert [fix.altitude_m for fix in decode_with(rules, no_undulation)] == [None]
+    assert [fix.altitude_m for fix in decode(no_undulation)] == [14.2]
+
+
+def test_qualities_and_errors_are_configured() -> None:
+    rules = FixRules(qualities=frozenset((6, 8)), uere_m={6: 30.0}, vertical_per_horizontal=1.5)
+    assert decode_with(rules, gga(quality=1) + rmc()) == []
+    (fix,) = decode_with(rules, gga(quality=6))
+    assert (fix.accuracy_m, fix.vertical_accuracy_m) == (pytest.approx(24.0), pytest.approx(36.0))
+    (fix,) = decode_with(rules, gga(quality=8))
+    assert (fix.accuracy_m, fix.accuracy_source) == (None, "none")
+
+
+def test_gns_serves_where_there_is_no_gga() -> None:
+    gns = "GNGNS,120000.00,6010.428,N,02454.390,E,{},12,0.80,14.2,17.9,1.5,0001,V"
+    (fix,) = decode(sentence(gns.format("NRF")) + rmc())
+    assert (fix.quality, fix.altitude_m, fix.undulation_m, fix.satellites) == (4, 14.2, 17.9, 12)
+    (fix,) = decode(sentence(gns.format("A")) + gga(quality=2, altitude="9"))
+    assert (fix.quality, fix.altitude_m) == (2, 9)
+
+
+def test_open_epoch_is_given_out_at_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    stop = Event()
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink([(1000, gga())]))
+    driver = make_driver("/dev/ttyX")
+    driver.connect()
+    reading = driver.read(stop)
+    assert next(reading).samples == ()
+    stop.set()
+    (part,) = reading
+    assert [arrival_ns for arrival_ns, _ in part.samples] == [1_000_000_000]
+
+
+def events_of(monkeypatch: pytest.MonkeyPatch, reads: list[tuple[int, bytes]], **keys: object) -> list[str]:
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
+    driver = DRIVER.create("gnss", NmeaConfig(**{"driver": "nmea", "port": "/dev/ttyX", "rate_hz": 10, **keys}))
+    driver.connect()
+    texts = []
+    with contextlib.suppress(RuntimeError):  # the reads are at their end
+        for part in driver.read(Event()):
+            texts += [event.text for event in part.events]
+    return texts
+
+
+def test_coarse_rtk_full_line_and_missing_separation_are_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    fixed = [(1000 + i * 100, gga(f"12000{i // 10}.{i % 10}0", quality=4)) for i in range(60)]
+    (text,) = events_of(monkeypatch, fixed)
+    assert "RTK positions come with 3 decimals of a minute" in text
+    sentences = [(at_ms, gga(f"12000{i // 10}.{i % 10}0")) for i, (at_ms, _) in enumerate(fixed)]
+    assert events_of(monkeypatch, sentences, baud=4800) == []  # of a pty the baud rate means nothing
+    monkeypatch.setattr(ScriptedLink, "byte_time_ns", 1e10 / 4800)
+    (text,) = events_of(monkeypatch, sentences, baud=4800)
+    assert "bytes/s are more than 90% of what the line carries" in text
+    no_undulation = sentence("GPGGA,120000.00,6010.428,N,02454.390,E,1,12,0.80,14.2,M,,M,,")
+    (text,) = events_of(monkeypatch, [(1000, no_undulation), (1050, b"")], altitude="ellipsoid")
+    assert "no altitude above the ellipsoid" in text
+
+
+def read_network(driver: NmeaDriver, send: Callable[[], None]) -> tuple[list[Chunk], list[FixSample]]:
+    driver.connect()
+    stop = Event()
+    chunks, fixes = [], []
+    sender = Thread(target=send)
+    sender.start()
+    for part in driver.read(stop):
+        chunks += part.chunks
+        fixes += [fix for _, fix in part.samples]
+        if len(fixes) >= 2:
+            stop.set()
+    sender.join()
+    return chunks, fixes
+
+
+def test_fixes_over_tcp_then_the_end_of_the_connection() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        driver = DRIVER.create("gnss", NmeaConfig(driver="nmea", tcp=address))
+        peers = []
+
+        def send() -> None:
+            peers.append(server.accept()[0])
+            sleep(0.05)
+            peers[0].sendall(gga("120000.00")[:20])
+            peers[0].sendall(gga("120000.00")[20:] + gga("120000.10"))
+
+        _, fixes = read_network(driver, send)
+        assert len(fixes) == 2
+        reading = driver.read(Event())
+        peers[0].close()
+        with pytest.raises(DeviceError, match=f"{address}: the receiver has closed the connection"):
+            next(reading)
+        driver.close()
+    with pytest.raises(DeviceError, match=f"{address}: cannot connect"):
+        driver.connect()
+
+
+def test_fixes_over_udp_from_the_first_sender() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    driver = DRIVER.create("gnss", NmeaConfig(driver="nmea", udp=str(port)))
+
+    def send() -> None:
+        sleep(0.05)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for part in (gga("120000.00")[:20], gga("120000.00")[20:] + gga("120000.10")):
+                sender.sendto(part, ("127.0.0.1", port))
+
+    chunks, fixes = read_network(driver, send)
+    assert len(fixes) == 2
+    assert [chunk.source[0] for chunk in chunks if chunk.source] == ["127.0.0.1"] * 2
+    driver.close()
+
+
+@pytest.mark.parametrize("keys", [{}, {"port": "/dev/ttyX", "tcp": "host:1"}])
+def test_the_receiver_is_in_one_place(keys: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match="set one of port, tcp and udp"):
+        NmeaConfig(driver="nmea", **keys)
+
+
+@pytest.mark.parametrize("address", ["host", "host:", "host:99999"])
+def test_address_on_the_network_that_is_none(address: str) -> None:
+    with pytest.raises(DeviceError, match="is not host:port"):
+        DRIVER.create("gnss", NmeaConfig(driver="nmea", tcp=address)).connect()

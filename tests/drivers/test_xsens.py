@@ -13,9 +13,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers import links
+from drivers import links, serial_care
 from drivers.device import DeviceError
-from drivers.imu import xsens
 from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder, XbusFramer, decode_mtdata2, mtdata2_items
 from drivers.imu.xsens import DRIVER, XsensConfig, XsensDriver
 from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample, Vector
@@ -323,8 +322,9 @@ def test_handshake_and_measurement(device: PtyDevice) -> None:
     assert b"".join(chunk.data for chunk in chunks if not chunk.sent) == device.sent
     assert b"".join(chunk.data for chunk in chunks if chunk.sent) == b"".join(device.asked)
     assert [chunk.arrival_ns for chunk in chunks] == sorted(chunk.arrival_ns for chunk in chunks)
-    for part in received[BEGUN:]:
-        assert all(arrival_ns == part.chunks[0].arrival_ns for arrival_ns, _ in part.samples)
+    # The second measurement began behind the answer to GoToMeasurement, and arrived when its first byte did.
+    stamps = [arrival_ns for part in received for arrival_ns, _ in part.samples]
+    assert stamps[0] == stamps[1] == received[1].chunks[-1].arrival_ns < stamps[2]
     assert all_events(received) == []
     (stream,) = driver.streams
     assert (stream.kind, stream.rate_hz) == ("imu", 400)
@@ -356,7 +356,7 @@ def test_hang_up_is_a_device_error(device: PtyDevice) -> None:
 
 
 def test_lost_request_is_sent_again(device: PtyDevice, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(xsens, "ANSWER_S", 0.05)
+    monkeypatch.setattr(serial_care, "ANSWER_S", 0.05)
     answer = device.answers.pop(GO_TO_CONFIG)
     device.answers[GO_TO_CONFIG * 2] = answer
     driver = make_driver(device.port)
@@ -366,7 +366,7 @@ def test_lost_request_is_sent_again(device: PtyDevice, monkeypatch: pytest.Monke
 
 
 def test_no_answer_names_port_baud_and_message(device: PtyDevice, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(xsens, "ANSWER_S", 0.02)
+    monkeypatch.setattr(serial_care, "ANSWER_S", 0.02)
     del device.answers[REQUEST_FIRMWARE]
     driver = make_driver(device.port)
     with pytest.raises(
@@ -429,6 +429,9 @@ def test_line_too_slow_for_the_rate() -> None:
 class ScriptedLink:
     """Reads come from a list of (arrival in seconds, bytes)."""
 
+    byte_time_ns = 0.0
+    events = ()
+
     def __init__(self, reads: list[tuple[float, bytes]]) -> None:
         self.reads = iter(reads)
 
@@ -441,7 +444,7 @@ class ScriptedLink:
 
 
 def scripted(monkeypatch: pytest.MonkeyPatch, reads: list[tuple[float, bytes]]) -> Iterator[Received]:
-    monkeypatch.setattr(links, "SerialLink", lambda port, baud: ScriptedLink(reads))
+    monkeypatch.setattr(links, "SerialLink", lambda port, baud, keep_dtr: ScriptedLink(reads))
     driver = make_driver("/dev/ttyX", configure=False)
     driver.connect()
     return driver.read(Event())

@@ -1,0 +1,185 @@
+"""MicroStrain MIP: bytes in, samples and replies out.
+
+A packet is `75 65 set length fields.. checksum(2)`, a field `length kind data`, all big-endian. The checksum is
+Fletcher's over everything before it.
+"""
+
+import math
+import re
+import struct
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Literal
+
+from drivers.framing import Framer, StepCounter
+from drivers.samples import ImuSample, Vector
+
+SYNC = b"\x75\x65"
+OVERHEAD_BYTES = 6
+MAX_PACKET_BYTES = 255 + OVERHEAD_BYTES
+MAX_REPLIES = 64
+
+SENSOR_SET, FILTER_SET = 0x80, 0x82
+LAST_COMMAND_SET = 0x7F
+ACCEL, GYRO, MAG = 0x04, 0x05, 0x06
+TEMPERATURE, GPS_CORRELATION = 0x14, 0x12
+TICKS, GPS_TIME, REFERENCE_TIME = 0xD1, 0xD3, 0xD5
+FIELD_BYTES = {
+    ACCEL: 12,
+    GYRO: 12,
+    MAG: 12,
+    TEMPERATURE: 12,
+    GPS_CORRELATION: 12,
+    GPS_TIME: 12,
+    TICKS: 4,
+    REFERENCE_TIME: 8,
+}
+
+M_S2_PER_G = 9.80665
+UT_PER_GAUSS = 100.0
+ZERO_CELSIUS_K = 273.15
+NS_PER_S = 1_000_000_000
+WEEK_S = 604_800
+
+_VECTOR = struct.Struct(">3f")
+_GPS = struct.Struct(">dHH")
+_START = re.compile(rb"\x75(?=\x65|\Z)")
+
+Packet = tuple[int, bytes]
+TimeSource = Literal["reference", "gps", "ticks"]
+
+
+@dataclass(frozen=True, slots=True)
+class GpsTime:
+    """GPS time as the device has it; before its receiver has a fix this is the time since the device was started.
+
+    flags: bit 0 time of week valid, bit 1 week valid.
+    """
+
+    week: int
+    time_of_week_s: float
+    flags: int
+
+
+def fletcher(data: bytes | bytearray) -> bytes:
+    """The two bytes of the checksum."""
+    sums = list(accumulate(data))
+    return bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
+
+
+def fields(payload: bytes) -> Iterator[tuple[int, bytes]]:
+    """The (kind, data) fields of a payload, up to where they stop making sense."""
+    position = 0
+    while position + 2 <= len(payload):
+        size = payload[position]
+        if size < 2 or position + size > len(payload):
+            return
+        yield payload[position + 1], payload[position + 2 : position + size]
+        position += size
+
+
+def _length(buffer: bytearray, position: int) -> int | None:
+    available = len(buffer) - position
+    if available < 4:
+        return None
+    length = buffer[position + 3] + OVERHEAD_BYTES
+    if available < length:
+        return None
+    end = position + length
+    return length if fletcher(buffer[position : end - 2]) == buffer[end - 2 : end] else 0
+
+
+@dataclass(slots=True)
+class MipDecoder:
+    """Measurements out of a MIP stream.
+
+    time_source: which field stamps a sample: nanoseconds since start (reference), the GPS correlation time of older
+    devices in nanoseconds, or the tick counter. gps_time: the last that came, with the device ticks it came with.
+    lost_messages: holes in the device time. frames: how many packets came, of any kind. replies: the latest of the
+    command sets. starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
+    """
+
+    time_source: TimeSource = "reference"
+    frames: int = 0
+    gps_time: tuple[int | None, GpsTime] | None = None
+    replies: deque[Packet] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
+    starts: list[int] = field(default_factory=list)
+    steps: StepCounter = field(default_factory=StepCounter)
+    framer: Framer = field(default_factory=lambda: Framer(_START, _length))
+    _ticks_of_last: int | None = None
+
+    @property
+    def bad_frames(self) -> int:
+        """Candidates for a packet that were none."""
+        return self.framer.bad_frames
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes outside of packets."""
+        return self.framer.skipped_bytes
+
+    @property
+    def lost_messages(self) -> int:
+        """Messages missing between two device times."""
+        return self.steps.lost
+
+    def feed(self, data: bytes) -> list[ImuSample]:
+        """The samples that `data` completes."""
+        samples: list[ImuSample] = []
+        self.starts = []
+        for start, packet in self.framer.feed(data):
+            self.frames += 1
+            if packet[2] <= LAST_COMMAND_SET:
+                self.replies.append((packet[2], packet[4:-2]))
+            elif packet[2] == SENSOR_SET and (sample := self._sample(packet[4:-2])) is not None:
+                samples.append(sample)
+                self.starts.append(start)
+        return samples
+
+    def _sample(self, payload: bytes) -> ImuSample | None:
+        came = {kind: data for kind, data in fields(payload) if len(data) == FIELD_BYTES.get(kind)}
+        ticks = self._ticks(came)
+        if GPS_TIME in came:
+            time_of_week_s, week, flags = _GPS.unpack(came[GPS_TIME])
+            self.gps_time = (ticks, GpsTime(week, time_of_week_s, flags))
+        accel, gyro = _vector(came.get(ACCEL), M_S2_PER_G), _vector(came.get(GYRO), 1.0)
+        mag = _vector(came.get(MAG), UT_PER_GAUSS)
+        if accel is not None or gyro is not None:
+            self._ticks_of_last = ticks
+            if ticks is not None:
+                self.steps.note(ticks)
+        elif mag is None:
+            return None
+        elif ticks is None:  # the magnetometer in a packet of its own, behind the one that has the time
+            ticks = self._ticks_of_last
+        celsius = _vector(came.get(TEMPERATURE), 1.0)  # lowest, highest, mean
+        return ImuSample(
+            None,
+            ticks,
+            accel,
+            gyro,
+            mag,
+            None if celsius is None else celsius[2] + ZERO_CELSIUS_K,
+        )
+
+    def _ticks(self, came: dict[int, bytes]) -> int | None:
+        match self.time_source:
+            case "reference" if REFERENCE_TIME in came:
+                return int.from_bytes(came[REFERENCE_TIME])
+            case "ticks" if TICKS in came:
+                return int.from_bytes(came[TICKS])
+            case "gps" if GPS_CORRELATION in came:
+                time_of_week_s, week, _ = _GPS.unpack(came[GPS_CORRELATION])
+                if 0 <= time_of_week_s < WEEK_S:
+                    ticks: int = week * WEEK_S * NS_PER_S + round(time_of_week_s * NS_PER_S)
+                    return ticks
+        return None
+
+
+def _vector(data: bytes | None, factor: float) -> Vector | None:
+    if data is None:
+        return None
+    x, y, z = _VECTOR.unpack(data)
+    return (x * factor, y * factor, z * factor) if math.isfinite(x + y + z) else None

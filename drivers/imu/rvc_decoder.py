@@ -1,0 +1,65 @@
+"""BNO08x in its UART-RVC mode: bytes in, samples with acceleration only out.
+
+A frame is `AA AA index yaw pitch roll ax ay az reserved(3) sum`, the sum over all behind the two AA.
+"""
+
+import re
+import struct
+from dataclasses import dataclass, field
+
+from drivers.framing import Framer
+from drivers.samples import ImuSample
+
+FRAME_BYTES = 19
+M_S2_PER_MG = 9.80665e-3
+RATE_HZ = 100.0  # fixed
+
+_BODY = struct.Struct("<B6h3xB")
+_START = re.compile(rb"\xaa(?=\xaa|\Z)")
+
+
+def _length(buffer: bytearray, position: int) -> int | None:
+    if len(buffer) - position < FRAME_BYTES:
+        return None
+    end = position + FRAME_BYTES
+    return FRAME_BYTES if sum(buffer[position + 2 : end - 1]) & 0xFF == buffer[end - 1] else 0
+
+
+@dataclass(slots=True)
+class RvcDecoder:
+    """Measurements out of a BNO08x's RVC stream; device ticks are the 8-bit index, 10 ms each.
+
+    lost_messages: holes in the index. frames: how many came.
+    starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
+    """
+
+    frames: int = 0
+    lost_messages: int = 0
+    starts: list[int] = field(default_factory=list)
+    framer: Framer = field(default_factory=lambda: Framer(_START, _length))
+    _index: int | None = None
+
+    @property
+    def bad_frames(self) -> int:
+        """Candidates for a frame that were none."""
+        return self.framer.bad_frames
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes outside of frames."""
+        return self.framer.skipped_bytes
+
+    def feed(self, data: bytes) -> list[ImuSample]:
+        """The samples that `data` completes."""
+        samples: list[ImuSample] = []
+        self.starts = []
+        for start, frame in self.framer.feed(data):
+            self.frames += 1
+            index, _, _, _, x, y, z, _ = _BODY.unpack_from(frame, 2)
+            if self._index is not None and index != self._index:
+                self.lost_messages += (index - self._index - 1) & 0xFF
+            self._index = index
+            accel_m_s2 = (x * M_S2_PER_MG, y * M_S2_PER_MG, z * M_S2_PER_MG)
+            samples.append(ImuSample(index, index, accel_m_s2, None))
+            self.starts.append(start)
+        return samples
