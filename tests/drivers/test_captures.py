@@ -2,6 +2,7 @@
 
 import struct
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from threading import Event
 
@@ -243,7 +244,7 @@ def test_any_bytes(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
     chunks, _ = read(path)
     assert sum(len(chunk.data) for chunk in chunks) <= len(content)
     arrivals_ns = [chunk.arrival_ns for chunk in chunks]
-    assert all(two > one - 1_000_000_001 for one, two in zip(arrivals_ns, arrivals_ns[1:], strict=False))
+    assert all(two > one - 1_000_000_001 for one, two in pairwise(arrivals_ns))
     survey(path).text()
 
 
