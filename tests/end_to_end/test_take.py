@@ -80,6 +80,8 @@ def test_tapes_decode_to_the_same_samples(take: Path, lines: list[dict], tmp_pat
     for kind in kinds:
         first = [line for line in lines if _kind(line) == kind]
         second = [line for line in again if _kind(line) == kind]
+        if kind == "gps" and len(second) == len(first) + 1:  # the end of a file ends the epoch that a take breaks off
+            del second[-1]
         assert list(map(_values, first)) == list(map(_values, second))
         times_s = np.array([[one["time"], two["time"]] for one, two in zip(first, second, strict=True)])
         assert np.abs(times_s[:, 0] - times_s[:, 1]).max() < SAME_TIME_S
