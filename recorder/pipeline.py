@@ -155,7 +155,7 @@ class Pipeline:
         sample = stamped.sample
         config = self._devices[stamped.device].config
         if isinstance(sample, ImuSample):
-            return self._writer.write_imu(time_ns, sample, late=late)
+            return self._writer.write_imu(stamped.device, time_ns, sample, late=late)
         elif isinstance(sample, FixSample):
             return self._writer.write_fix(time_ns, sample, late=late)
         elif isinstance(sample, PoseSample):

@@ -225,7 +225,7 @@ def _write_items(twin: Twin, writer: RecordingWriter, devices: dict[str, DeviceS
             continue
         counts.written += 1
         if isinstance(sample, ImuSample):
-            writer.write_imu(time_ns, sample)
+            writer.write_imu(name, time_ns, sample)
         elif isinstance(sample, PoseSample):
             writer.write_pose(time_ns, str(twin.entries[name].get("name", "groundTruth")), sample)
         elif isinstance(sample, FixSample):

@@ -238,9 +238,11 @@ def _check_counts(manifest: Manifest, data: DataCheck, findings: Findings) -> No
     def count(*streams: str) -> int:
         return sum(data.streams.by_name[name].count for name in streams if name in data.streams.by_name)
 
+    sensor_lines: Counter[str] = Counter()
+    for device in manifest.devices.values():
+        sensor_lines.update(device.stream.sensor_lines)
     pairs = [
-        ("accelerometer", written("imu"), count("accelerometer")),
-        ("gyroscope", written("imu"), count("gyroscope")),
+        *((sensor, promised, count(sensor)) for sensor, promised in sensor_lines.items()),
         ("gps", written("gnss"), count("gps")),
         ("lidar", written("lidar"), count("lidar")),
         ("poses", written("pose"), count(*data.pose_streams)),

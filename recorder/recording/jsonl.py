@@ -90,8 +90,8 @@ class PendingScan:
 Pending = bytes | PendingFrames | PendingScan
 
 
-def imu_lines(time_ns: int, sample: ImuSample) -> list[bytes]:
-    """One line per sensor of an IMU sample, accelerometer first; none when a value is not a number."""
+def imu_lines(time_ns: int, sample: ImuSample) -> list[tuple[str, bytes]]:
+    """Name and line of each sensor of an IMU sample, accelerometer first; none when a value is not a number."""
     time_s = time_ns / NS_PER_S
     sensors = (
         ("accelerometer", sample.accel_m_s2),
@@ -102,7 +102,7 @@ def imu_lines(time_ns: int, sample: ImuSample) -> list[bytes]:
     present = [SensorValues(kind, values) for kind, values in sensors if values is not None]
     if not all(map(math.isfinite, (value for sensor in present for value in sensor.values))):
         return []
-    return [encode_json(SensorLine(sensor, time_s)) for sensor in present]
+    return [(sensor.type, encode_json(SensorLine(sensor, time_s))) for sensor in present]
 
 
 def fix_line(time_ns: int, fix: FixSample) -> bytes | None:

@@ -22,7 +22,8 @@ class StreamSummary(msgspec.Struct, omit_defaults=False):
     recording; dropped: came but could not be recorded, for want of room or because a picture before was lost; lost:
     never came, by the device's own numbering (of a lidar packets, else samples). late: written out of order first and
     merged at the end; before_start: sampled before time 0, or pictures before the first key frame; incomplete: lacked
-    what the format needs (a fix without altitude). rate_hz: expected, null where unknown.
+    what the format needs (a fix without altitude). rate_hz: expected, null where unknown. sensor_lines: of an IMU, how
+    many lines of each sensor were written (not every sample has every sensor).
     """
 
     kind: str
@@ -34,6 +35,7 @@ class StreamSummary(msgspec.Struct, omit_defaults=False):
     late: int = 0
     before_start: int = 0
     incomplete: int = 0
+    sensor_lines: dict[str, int] = {}
 
 
 class DeviceSummary(msgspec.Struct):

@@ -93,11 +93,13 @@ class RecordingWriter:
     def _refused(self, camera: str) -> Callable[[str], None]:
         return lambda text: self.events.write(camera, "drop", text)
 
-    def write_imu(self, time_ns: int, sample: ImuSample, *, late: bool = False) -> bool:
-        """One line per sensor of the sample; False when a value is not a number."""
+    def write_imu(self, device: str, time_ns: int, sample: ImuSample, *, late: bool = False) -> bool:
+        """One line per sensor of the sample, counted for its device; False when a value is not a number."""
         lines = imu_lines(time_ns, sample)
-        for line in lines:
+        counts = self.manifest.devices[device].stream.sensor_lines
+        for sensor, line in lines:
             self._lines.put(line, late=late)
+            counts[sensor] = counts.get(sensor, 0) + 1
         return bool(lines)
 
     def write_fix(self, time_ns: int, fix: FixSample, *, late: bool = False) -> bool:

@@ -57,6 +57,8 @@ def camera(x_m: float) -> dict[str, Any]:
 
 def device(kind: str, rate_hz: float, written: int) -> dict[str, Any]:
     stream = {"kind": kind, "rate_hz": rate_hz, "received": written, "written": written}
+    if kind == "imu":
+        stream["sensor_lines"] = {"accelerometer": written, "gyroscope": written}
     return {"driver": "hand", "clock": "host", "latency_s": 0.0, "identity": {}, "stream": stream}
 
 
@@ -222,7 +224,10 @@ def scale(recording: Recording, kind: str, factor: float) -> None:
 
 
 def count(recording: Recording, name: str, **counts: int) -> None:
-    recording.manifest["devices"][name]["stream"] |= counts
+    stream = recording.manifest["devices"][name]["stream"]
+    stream |= counts
+    if name == "imu" and "written" in counts:
+        stream["sensor_lines"] = dict.fromkeys(("accelerometer", "gyroscope"), counts["written"])
 
 
 def swap_times(recording: Recording, kind: str) -> None:

@@ -57,7 +57,7 @@ def frames(time_ns: int, *states: str | None) -> PendingFrames:
 
 
 def plain(time_ns: int) -> bytes:
-    return imu_lines(time_ns, ImuSample(None, None, (0.0, 0.0, 9.81), None))[0]
+    return imu_lines(time_ns, ImuSample(None, None, (0.0, 0.0, 9.81), None))[0][1]
 
 
 class Writer(LineWriter):
@@ -71,7 +71,7 @@ class Writer(LineWriter):
 
 def test_one_line_for_each_sensor_accelerometer_first():
     sample = ImuSample(7, 1, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0), 300.5)
-    assert [json.loads(line) for line in imu_lines(1_234_567_891, sample)] == [
+    assert [json.loads(line) for _, line in imu_lines(1_234_567_891, sample)] == [
         {"sensor": {"type": "accelerometer", "values": [1.0, 2.0, 3.0]}, "time": 1.234567891},
         {"sensor": {"type": "gyroscope", "values": [4.0, 5.0, 6.0]}, "time": 1.234567891},
         {"sensor": {"type": "magnetometer", "values": [7.0, 8.0, 9.0]}, "time": 1.234567891},
@@ -80,8 +80,8 @@ def test_one_line_for_each_sensor_accelerometer_first():
 
 
 def test_a_sample_lists_only_what_it_carries():
-    (line,) = imu_lines(0, ImuSample(None, None, None, (0.0, 0.0, 1.0)))
-    assert json.loads(line)["sensor"]["type"] == "gyroscope"
+    ((sensor, line),) = imu_lines(0, ImuSample(None, None, None, (0.0, 0.0, 1.0)))
+    assert sensor == json.loads(line)["sensor"]["type"] == "gyroscope"
 
 
 def test_fix_has_the_formats_keys_and_no_null():
