@@ -6,7 +6,10 @@
 `take` is called with every sample in order of arrival, `advance` every few milliseconds, `finish` once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
 
 from drivers.device import DeviceConfig
 from drivers.samples import (
@@ -22,6 +25,7 @@ from drivers.samples import (
 )
 from recorder.clock import ClockMap
 from recorder.recording.manifest import NS_PER_S, ClockSummary, StreamSummary
+from recorder.recording.raw import NONE, scan_rows
 from recorder.recording.writer import RecordingWriter
 from recorder.synchronizer import FrameSet, Released, Synchronizer
 from recorder.timebase import HOLD_AT_START_NS, Stamped, Timebase
@@ -49,6 +53,31 @@ class DeviceInTake:
     last_picture_ns: int = -1
 
 
+@dataclass(slots=True)
+class _ClockTable:
+    """Rows of a device's clock table (see recorder.recording.raw) since they were last taken."""
+
+    rows: list[tuple[int, int, int]] = field(default_factory=list)
+    batches: list[npt.NDArray[np.int64]] = field(default_factory=list)
+
+    def add(self, stamped: Stamped, time_ns: int, start_ns: int) -> None:
+        """What is to be kept of a sample that is no picture."""
+        sample = stamped.sample
+        if isinstance(sample, ScanSample):
+            if stamped.point_host_ns is not None and stamped.point_ticks is not None:
+                self.batches.append(scan_rows(stamped.point_ticks, stamped.point_host_ns - start_ns, time_ns))
+        elif not isinstance(sample, ClockPairs) and sample.device_ticks is not None:
+            self.rows.append((sample.device_ticks, stamped.arrival_ns, time_ns))
+
+    def taken(self) -> list[npt.NDArray[np.int64]]:
+        """All rows, which are then forgotten."""
+        batches, self.batches = self.batches, []
+        if self.rows:
+            batches.append(np.array(self.rows, dtype=np.int64))
+            self.rows = []
+        return [np.concatenate(batches)] if batches else []
+
+
 class Pipeline:
     """Takes samples of all devices and writes them in their order."""
 
@@ -65,11 +94,15 @@ class Pipeline:
             self._timebase.add_device(device.name, device.clock, device.tick_hz, device.wrap_bits, latency_ns)
         cameras = sum(device.camera is not None for device in devices)
         self._synchronizer: Synchronizer[Stamped, FrameSample] = Synchronizer(cameras, pair_within_ns)
+        self._tables = {device.name: _ClockTable() for device in devices}
         self._last_pairs_ns = start_ns
 
     def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
         """Feed one sample with its arrival on the host's monotonic clock."""
-        if not isinstance(sample, ClockPairs):
+        if isinstance(sample, ClockPairs):
+            none = np.full(sample.ticks.size, NONE, np.int64)
+            self._tables[device].batches.append(np.column_stack((sample.ticks, sample.arrival_ns, none)))
+        else:
             self._devices[device].summary.received += 1
         self._timebase.take(device, arrival_ns, sample)
 
@@ -78,18 +111,21 @@ class Pipeline:
         device.last_host_ns = stamped.host_ns
         time_ns = stamped.host_ns - self._start_ns
         if isinstance(stamped.sample, FrameSample | LostFrame):
-            self._place_picture(device, time_ns, stamped.device_ns, stamped.sample)
-        elif time_ns < 0:
+            line_ns = self._place_picture(device, time_ns, stamped.device_ns, stamped.sample)
+            self._tables[stamped.device].rows.append((stamped.sample.device_ticks, stamped.arrival_ns, line_ns))
+            return
+        self._tables[stamped.device].add(stamped, time_ns, self._start_ns)
+        if time_ns < 0:
             device.summary.before_start += 1
         else:
             self._synchronizer.add(time_ns, stamped)
 
     def _place_picture(
         self, device: DeviceInTake, time_ns: int, device_ns: int, sample: FrameSample | LostFrame
-    ) -> None:
+    ) -> int:
         """A video begins with a key frame at or after time 0 and its pictures have ascending times.
 
-        A picture that must be left out takes those after it along, up to the next key frame.
+        A picture that must be left out takes those after it along, up to the next key frame. Gives the line's time.
         """
         assert device.camera is not None
         has_begun = device.last_picture_ns >= 0
@@ -97,16 +133,16 @@ class Pipeline:
         if isinstance(sample, FrameSample) and is_later and (sample.is_keyframe or not device.wait_for_keyframe):
             device.wait_for_keyframe = False
             device.last_picture_ns = time_ns
-            self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
-            return
+            return self._synchronizer.add_picture(device.camera, device_ns, time_ns, sample)
         device.wait_for_keyframe = True
         if not has_begun:
             device.summary.before_start += 1
-            return
+            return time_ns
         device.summary.received -= 1
         device.summary.dropped += 1
         if is_later:
-            self._synchronizer.add_picture(device.camera, device_ns, time_ns, None)
+            return self._synchronizer.add_picture(device.camera, device_ns, time_ns, None)
+        return time_ns
 
     def advance(self, now_ns: int) -> None:
         """Write what is old enough that nothing earlier is to be expected."""
@@ -119,18 +155,19 @@ class Pipeline:
             self._write(self._synchronizer.release(now_ns - WINDOW_NS - self._start_ns))
         if now_ns - self._last_pairs_ns >= PAIRS_EVERY_NS:
             self._last_pairs_ns = now_ns
-            self._write_pairs()
+            self._write_tables()
 
     def finish(self) -> None:
         """Write all that is left."""
         for stamped in self._timebase.flush():
             self._place(stamped)
         self._write(self._synchronizer.flush())
-        self._write_pairs()
+        self._write_tables()
 
-    def _write_pairs(self) -> None:
-        for device, pairs in self._timebase.take_pairs().items():
-            self._writer.raw.put_pairs(device, pairs)
+    def _write_tables(self) -> None:
+        for device, table in self._tables.items():
+            for rows in table.taken():
+                self._writer.raw.put_clock_rows(device, rows)
 
     def _write(self, released: list[Released[Stamped, FrameSample]]) -> None:
         for entry in released:

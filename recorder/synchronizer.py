@@ -55,13 +55,16 @@ class Synchronizer(Generic[T, P]):
         """Take an item of any stream but cameras."""
         self._push(time_ns, item)
 
-    def add_picture(self, camera: int, device_ns: int, time_ns: int, picture: P | None) -> None:
-        """Take a camera's picture (None: it was taken and is lost) and pair it by device time."""
-        for _, frame_set in reversed(self._open_sets):
+    def add_picture(self, camera: int, device_ns: int, time_ns: int, picture: P | None) -> int:
+        """Take a camera's picture (None: it was taken and is lost) and pair it by device time.
+
+        Gives the time of its frame set.
+        """
+        for set_time_ns, frame_set in reversed(self._open_sets):
             if abs(frame_set.device_ns - device_ns) < self.pair_within_ns:
                 if frame_set.pictures[camera] is None:
                     frame_set.pictures[camera] = picture
-                    return
+                    return set_time_ns
                 break  # a second picture of one camera within half a period: kept as a set of its own
         frame_set = FrameSet(device_ns, [None] * self.cameras)
         frame_set.pictures[camera] = picture
@@ -73,6 +76,7 @@ class Synchronizer(Generic[T, P]):
             time_ns = self._between_neighbours(device_ns, time_ns)
         self._open_sets.append((time_ns, frame_set))
         self._push(time_ns, frame_set)
+        return time_ns
 
     def _between_neighbours(self, device_ns: int, time_ns: int) -> int:
         """Keep sets in the order of their device times, which mapped times of two cameras may contradict.

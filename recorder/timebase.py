@@ -23,14 +23,17 @@ HOLD_NS = 400_000_000
 class Stamped:
     """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock.
 
-    point_host_ns: host times of a scan's points, (n,) int64; the scan's time is the greatest of them.
+    arrival_ns: when it came, its device's latency not taken off.
+    point_host_ns, point_ticks: host and device times of a scan's points, (n,) int64; the scan's time is the greatest.
     """
 
     device: str
     host_ns: int
     device_ns: int
+    arrival_ns: int
     sample: Sample
     point_host_ns: npt.NDArray[np.int64] | None = None
+    point_ticks: npt.NDArray[np.int64] | None = None
 
 
 @dataclass(slots=True)
@@ -41,8 +44,6 @@ class _DeviceStream:
     tick_hz: float
     latency_ns: int
     last_host_ns: int = -(1 << 62)
-    pairs: list[tuple[int, int]] = field(default_factory=list)
-    batches: list[npt.NDArray[np.int64]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -90,14 +91,12 @@ class Timebase:
         clock = entry.clock
         arrival_ns -= entry.latency_ns
         if isinstance(sample, ClockPairs):
-            entry.batches.append(np.column_stack((sample.ticks, sample.arrival_ns)))
             entry.stream.observe_many(sample.ticks, sample.arrival_ns - entry.latency_ns)
         elif isinstance(sample, ScanSample):
             clock.waiting.append((entry, entry.stream.unwrap(sample.last_ticks), arrival_ns, sample))
         elif sample.device_ticks is None:
-            self._unclocked.append(Stamped(device, arrival_ns, arrival_ns, sample))
+            self._unclocked.append(Stamped(device, arrival_ns, arrival_ns, arrival_ns + entry.latency_ns, sample))
         else:
-            entry.pairs.append((sample.device_ticks, arrival_ns + entry.latency_ns))
             device_ns = entry.stream.observe(sample.device_ticks, arrival_ns)
             clock.waiting.append((entry, device_ns, arrival_ns, sample))
         self._watch_epoch(clock, arrival_ns)
@@ -124,23 +123,12 @@ class Timebase:
 
     def _stamp(self, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
         host_ns = min(entry.clock.map.host_ns(device_ns), arrival_ns)
-        point_host_ns = None
+        point_host_ns = ticks = None
         if isinstance(sample, ScanSample) and len(sample.points):
             ticks = np.rint(sample.points["timestamp"] * entry.tick_hz).astype(np.int64)
-            point_host_ns = np.minimum(entry.clock.map.host_ns(entry.stream.unwrap(ticks)), arrival_ns)
+            point_host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
+            point_host_ns -= max(int(point_host_ns.max()) - arrival_ns, 0)  # all of them: points never share a time
             host_ns = int(point_host_ns.max())
         host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
         entry.last_host_ns = host_ns
-        return Stamped(entry.device, host_ns, device_ns, sample, point_host_ns)
-
-    def take_pairs(self) -> dict[str, npt.NDArray[np.int64]]:
-        """(ticks, arrival) pairs (n, 2) of each device since this was last called, for the raw tape."""
-        taken = {}
-        for device, entry in self._streams.items():
-            parts = list(entry.batches)
-            if entry.pairs:
-                parts.append(np.array(entry.pairs, dtype=np.int64))
-            if parts:
-                taken[device] = np.concatenate(parts)
-            entry.pairs, entry.batches = [], []
-        return taken
+        return Stamped(entry.device, host_ns, device_ns, arrival_ns + entry.latency_ns, sample, point_host_ns, ticks)

@@ -5,8 +5,17 @@ IPv4/UDP packets, serial chunks under a user link type (LINKTYPE_USER0; bytes we
 are UTC: the arrival on the host's monotonic clock plus a constant, `utc_at_time_0.utc_ns - start_monotonic_ns` of
 recording.json. Format: the pcapng Internet-Draft (draft-ietf-opsawg-pcapng), sections 4.1 to 4.3.
 
-raw/DEVICE.clock holds the pairs that the clock map was fed: little-endian int64 (device ticks, arrival in monotonic
-ns), 16 bytes a pair.
+raw/DEVICE.clock is a table of little-endian int64, three to a row: device ticks, arrival in monotonic ns, and the stamp
+that was given online, in ns of recording time: the line's `time` is exactly stamp / 1e9. So each line can be traced to
+its ticks and stamped anew.
+
+- A message that is no line of its own (a lidar packet) has NONE as stamp.
+- A lidar scan has SCAN_ROWS rows on end, with NONE as arrival (nothing is to be learnt from them): the ticks and stamps
+  of points spread over the scan, ascending, then the last point's ticks with the stamp of the line.
+- The pictures of a frame set have the stamp of their line, a lost one too.
+- Samples without device time have no row.
+
+raw/DEVICE.refined holds one int64 for each row of DEVICE.clock: its time after refinement (see recorder.resync).
 """
 
 import struct
@@ -25,9 +34,13 @@ FOLDER = "raw"
 QUEUE_BYTES = 64 << 20
 FLUSH_S = 0.5
 SYNC_S = 1.0
+NONE = -(1 << 63)
+SCAN_ROWS = 64
 LINKTYPE_RAW_IP = 101
 LINKTYPE_USER0 = 147
 MAX_SERIAL_PACKET = 65535
+Ints = npt.NDArray[np.int64]
+
 _UINT32 = struct.Struct("<I")
 _BLOCK_HEAD = struct.Struct("<IIIIIII")  # type, length, interface, time high, time low, captured, original
 _IP_UDP = struct.Struct(">BBHHHBBH4s4sHHHH")
@@ -102,6 +115,23 @@ def _packed_address(address: str) -> bytes:
     return bytes(int(part) for part in address.split("."))
 
 
+def scan_rows(point_ticks: Ints, point_time_ns: Ints, line_time_ns: int) -> Ints:
+    """(SCAN_ROWS, 3): what the clock table keeps of a scan."""
+    chosen = np.linspace(0, len(point_ticks) - 1, SCAN_ROWS - 1).astype(np.int64)
+    chosen = chosen[np.argsort(point_time_ns[chosen], kind="stable")]
+    rows = np.full((SCAN_ROWS, 3), NONE, np.int64)
+    rows[:-1, 0], rows[:-1, 2] = point_ticks[chosen], point_time_ns[chosen]
+    rows[-1, 0], rows[-1, 2] = point_ticks[int(point_time_ns.argmax())], line_time_ns
+    return rows
+
+
+def read_clock_table(path: Path) -> Ints:
+    """(n, 3) int64: ticks, arrival, online stamp; half a row at the end of a cut file is left out. Raises OSError."""
+    flat = np.fromfile(path, "<i8")
+    rows: Ints = flat[: flat.size // 3 * 3].reshape(-1, 3).astype(np.int64)
+    return rows
+
+
 class RawWriter:
     """Writes tapes and clock pairs of all devices in one thread; a full queue drops and counts.
 
@@ -131,8 +161,8 @@ class RawWriter:
         if not self._queue.offer((device, chunks), size + 64 * len(chunks)):
             self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + size
 
-    def put_pairs(self, device: str, pairs: npt.NDArray[np.int64]) -> None:
-        """Take (n, 2) int64 (ticks, arrival_ns)."""
+    def put_clock_rows(self, device: str, pairs: npt.NDArray[np.int64]) -> None:
+        """Take (n, 3) int64 rows of the clock table: ticks, arrival, online stamp."""
         data = pairs.astype("<i8").tobytes()
         if not self._queue.offer((device, data), len(data)):
             self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + len(data)

@@ -23,6 +23,7 @@ from drivers.samples import (
 from recorder.pipeline import DeviceInTake, Pipeline
 from recorder.recording.jsonl import merge_late_lines
 from recorder.recording.manifest import DeviceSummary, StreamSummary, read_manifest
+from recorder.recording.raw import NONE, SCAN_ROWS, read_clock_table
 from recorder.recording.writer import RecordingWriter, new_manifest
 
 S = 1_000_000_000
@@ -313,7 +314,30 @@ def test_all_streams_are_merged_in_order_and_counted(tmp_path, pictures, in_step
     files = set(read_manifest(tmp_path).files)
     on_disk = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert files == on_disk - {"recording.json"}
-    assert np.fromfile(tmp_path / "raw" / "lidar.clock", "<i8").size == 2 * 1800
+    assert len(read_clock_table(tmp_path / "raw" / "lidar.clock")) == 1800 + 18 * SCAN_ROWS
+    every_line_is_in_a_clock_table(tmp_path, lines)
+
+
+def every_line_is_in_a_clock_table(folder, lines):
+    """The stamp of a row is the line's time to the nanosecond; rows keep ticks and arrival as they came."""
+    tables = {name: read_clock_table(folder / "raw" / f"{name}.clock") for name in ALL}
+    stamps = {name: (table[:, 2] / 1e9).tolist() for name, table in tables.items()}
+    for line in lines:
+        time_s = line["time"]
+        if "sensor" in line:
+            assert time_s in stamps["imu"]
+        elif "frames" in line:
+            assert all(time_s in stamps[camera] for camera in CAMERAS)
+        else:
+            (device,) = line.keys() & {"gps", "lidar", "groundTruth"}
+            assert time_s in stamps[{"gps": "gnss", "groundTruth": "pose"}.get(device, device)]
+    packets = tables["lidar"][tables["lidar"][:, 1] != NONE]
+    assert (packets[:, 1] - packets[:, 0] == START_NS - 77 * S + DELAY_NS).all()
+    assert (packets[:, 2] == NONE).all()
+    scans = tables["lidar"][tables["lidar"][:, 1] == NONE].reshape(-1, SCAN_ROWS, 3)
+    assert (np.diff(scans[:, :, 2], axis=1) >= 0).all()
+    assert [line["time"] for line in lines if "lidar" in line] == (scans[:, -1, 2] / 1e9).tolist()
+    assert (tables["imu"][:, 1] - tables["imu"][:, 0] == START_NS - 9 * S + DELAY_NS).all()
 
 
 def test_late_samples_of_every_kind_are_kept_in_order_and_counted(tmp_path, pictures, in_step, read_lines):
@@ -418,7 +442,7 @@ class Recorded:
         self.lines = {False: [], True: []}
         self.videos = ([], [])
         self.events = SimpleNamespace(write=lambda *_: None)
-        self.raw = SimpleNamespace(put_pairs=lambda *_: None)
+        self.raw = SimpleNamespace(put_clock_rows=lambda *_: None)
 
     def write_frames(self, time_ns, frames, *, late):
         for video, frame in zip(self.videos, frames, strict=True):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.samples import Chunk
-from recorder.recording.raw import RawWriter
+from recorder.recording.raw import NONE, RawWriter, read_clock_table
 
 UTC_MINUS_MONOTONIC_NS = 1_700_000_000_123_456_789
 LIDAR = ("192.168.1.200", 6699)
@@ -109,7 +109,7 @@ def record(folder, items, *, tape=True):
         if isinstance(item, tuple):
             writer.put_chunks(device, item)
         else:
-            writer.put_pairs(device, item)
+            writer.put_clock_rows(device, item)
     entries = writer.close()
     assert errors == []
     return entries, writer
@@ -176,25 +176,28 @@ def test_the_largest_datagram_fits(tmp_path):
 
 
 def test_devices_have_tapes_and_pairs_of_their_own(tmp_path):
-    pairs = np.array([[1, 10], [-2, 20], [1 << 40, 1 << 50]], dtype=np.int64)
+    rows = np.array([[1, 10, 5], [-2, 20, NONE], [1 << 40, 1 << 50, 7]], dtype=np.int64)
     entries, _ = record(
         tmp_path,
         [
             ("lidar", (Chunk(1, b"points", LIDAR, HOST),)),
             ("imu", (Chunk(2, b"bytes"),)),
-            ("imu", pairs),
-            ("imu", pairs + 1),
+            ("imu", rows),
+            ("imu", rows[:2]),
             ("lidar", (Chunk(3, b"more", LIDAR, HOST),)),
         ],
     )
     assert sorted(entries) == ["raw/imu.clock", "raw/imu.pcapng", "raw/lidar.pcapng"]
-    read = np.fromfile(tmp_path / "raw" / "imu.clock", "<i8").reshape(-1, 2)
-    assert np.array_equal(read, np.concatenate((pairs, pairs + 1)))
+    read = np.fromfile(tmp_path / "raw" / "imu.clock", "<i8").reshape(-1, 3)
+    assert np.array_equal(read, np.concatenate((rows, rows[:2])))
+    with (tmp_path / "raw" / "imu.clock").open("ab") as file:
+        file.write(b"half a row")
+    assert np.array_equal(read_clock_table(tmp_path / "raw" / "imu.clock"), read)
     assert len(read_tape((tmp_path / "raw" / "lidar.pcapng").read_bytes()).packets) == 2
 
 
 def test_without_tape_the_pairs_are_still_kept(tmp_path):
-    entries, _ = record(tmp_path, [("imu", (Chunk(2, b"bytes"),)), ("imu", np.array([[1, 2]]))], tape=False)
+    entries, _ = record(tmp_path, [("imu", (Chunk(2, b"bytes"),)), ("imu", np.array([[1, 2, 3]]))], tape=False)
     assert list(entries) == ["raw/imu.clock"]
 
 
@@ -211,7 +214,7 @@ def test_a_full_queue_drops_and_counts_wire_bytes(tmp_path, monkeypatch):
     writer = RawWriter(tmp_path, 0, lambda *error: None, tape=True)
     for _ in range(5):
         writer.put_chunks("lidar", (Chunk(1, bytes(300), LIDAR, HOST),))
-    writer.put_pairs("lidar", np.zeros((50, 2), np.int64))
+    writer.put_clock_rows("lidar", np.zeros((50, 2), np.int64))
     assert writer.dropped_bytes == {"lidar": 3 * 300 + 800}
     writer.close()
     tape = read_tape((tmp_path / "raw" / "lidar.pcapng").read_bytes())
@@ -230,7 +233,7 @@ def test_full_disk_is_told_nobody_waits_and_all_files_are_closed(tmp_path, files
     writer = RawWriter(tmp_path, 0, lambda name, error: errors.append(error), tape=True)
     with files_limited_to(1_000_000):
         for _ in range(3):
-            writer.put_pairs("imu", np.zeros((3, 2), np.int64))
+            writer.put_clock_rows("imu", np.zeros((3, 2), np.int64))
             writer.put_chunks("imu", (Chunk(1, bytes(2_000_000)),))
             writer.put_chunks("lidar", (Chunk(1, bytes(1000), LIDAR, HOST),))
         with pytest.raises(OSError, match="File too large"):

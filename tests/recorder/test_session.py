@@ -259,7 +259,7 @@ def test_a_whole_rig_recorded_until_it_is_stopped(bench, pictures, counts_are_tr
         assert manifest.devices[name].identity == {"serial": "17"}
     assert manifest.clocks.keys() == {"imu", "cameras", "pose"}
     assert all(clock.epochs == 1 for clock in manifest.clocks.values())
-    pairs = np.fromfile(folder / "raw" / "imu.clock", "<i8").reshape(-1, 2)
+    pairs = np.fromfile(folder / "raw" / "imu.clock", "<i8").reshape(-1, 3)
     assert len(pairs) == 200
     assert set((pairs[:, 1] - pairs[:, 0]).tolist()) == {DELAY_NS}
     assert (folder / "raw" / "imu.pcapng").stat().st_size > 200 * 32

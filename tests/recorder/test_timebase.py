@@ -210,26 +210,17 @@ def test_a_scan_without_points_still_has_a_time():
     assert abs(entry.host_ns - arrival_ns) < MS
 
 
-# -- pairs for the raw tape --
-
-
-def test_pairs_are_what_came_with_nothing_taken_off():
-    timebase = one_device(latency_ns=3 * MS)
-    feed(timebase, 0, 5)
-    pairs = timebase.take_pairs()["imu"]
-    assert pairs.tolist() == [[index * 5000, truth_ns(index) + FLOOR_NS] for index in range(5)]
-    assert timebase.take_pairs() == {}
-
-
-def test_pairs_of_packets_are_kept_once():
+def test_a_scan_later_than_its_arrival_is_moved_as_a_whole():
+    """Were each of its points cut off at the arrival, the last ones would share a time."""
     timebase = Timebase(START_NS)
-    timebase.add_device("lidar", "lidar", 1e6, 0, 2 * MS)
-    pairs, scan, arrival_ns = scan_of(0)
-    timebase.take("lidar", arrival_ns, pairs)
-    timebase.take("lidar", arrival_ns, scan)
-    taken = timebase.take_pairs()["lidar"]
-    assert np.array_equal(taken[:, 0], pairs.ticks)
-    assert np.array_equal(taken[:, 1], pairs.arrival_ns)
+    timebase.add_device("lidar", "lidar", 1e6, 0, 0)
+    for index in range(15):
+        pairs, scan, arrival_ns = scan_of(index)
+        timebase.take("lidar", arrival_ns, pairs)
+        timebase.take("lidar", arrival_ns - 40 * MS, scan)
+    for entry in timebase.flush():
+        assert entry.host_ns == entry.point_host_ns.max() == entry.arrival_ns
+        assert np.diff(entry.point_host_ns[::2]).min() > 0.9 * PACKET_NS
 
 
 def test_an_unknown_device_is_a_programming_error():
