@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -25,9 +26,10 @@ from recorder.recording.check import check as check_recording
 from recorder.recording.check import print_report
 from recorder.recording.info import info as recording_info
 from recorder.recording.info import print_info
+from recorder.resync import resync as resync_recording
 from recorder.rig import Rig, load_rig, parse_rig
 from recorder.session import record as record_take
-from recorder.status import DecodeProgress, StatusDisplay, print_summary
+from recorder.status import DecodeProgress, StatusDisplay, print_refinement, print_summary
 
 RigFile = click.Path(exists=True, dir_okay=False, path_type=Path)
 Folder = click.Path(file_okay=False, path_type=Path)
@@ -70,6 +72,7 @@ def clear_errors(verbose: bool) -> Iterator[None]:
 @click.option("-o", "--output", type=Folder, default="recordings", show_default=True, help="Where takes go.")
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
 @click.option("--name", help="Name of the take's folder (default: UTC time).")
+@click.option("--resync/--no-resync", "refine", default=True, help="Refine all times at the end (default: yes).")
 @set_option
 @click.pass_obj
 def record(
@@ -79,11 +82,13 @@ def record(
     output: Path,
     duration: float | None,
     name: str | None,
+    refine: bool,
     settings: tuple[str, ...],
 ) -> None:
     """Record one take of the rig described in RIG (a rig.yaml) into a new folder.
 
-    Stop with Ctrl-C; all files are then finished. Each take goes to OUTPUT/<UTC time>, or OUTPUT/NAME.
+    Stop with Ctrl-C; all files are then finished, and the times of all samples are refined by what came after them.
+    Each take goes to OUTPUT/<UTC time>, or OUTPUT/NAME.
 
     \b
     Examples:
@@ -108,11 +113,25 @@ def record(
             on_event=display.event,
         )
     print_summary(console, manifest)
+    if refine and manifest.state == "complete":
+        try:
+            _refine(folder, None, console)
+        except RecorderError as error:  # the take is whole, with the times given online
+            click.echo(f"rigtape: times not refined: {error}", err=True)
     console.print(f"{manifest.duration_s:.1f} s recorded in {folder} (ended by: {manifest.stopped_by})", soft_wrap=True)
     console.print(f"next: rigtape check {folder}", soft_wrap=True)
     console.print(f"      rigtape info {folder}", soft_wrap=True)
     if manifest.stopped_by not in ("duration", "interrupt"):
         sys.exit(1)
+
+
+def _refine(folder: Path, out: Path | None, console: Console) -> None:
+    """Refine the times of a recording, and tell by how much they moved."""
+    begun_s = time.monotonic()
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("refining the times", total=1.0)
+        manifest = resync_recording(folder, out, lambda done: bar.update(task, completed=done))
+    print_refinement(console, manifest, time.monotonic() - begun_s)
 
 
 @contextlib.contextmanager
@@ -224,6 +243,29 @@ def decode(verbose: bool, capture: Path, driver: str, output: Path, settings: tu
     if decoded.fault:
         click.echo(f"rigtape: {decoded.fault}; what comes before is in {decoded.folder}", err=True)
         sys.exit(1)
+
+
+@main.command()
+@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("-o", "--output", type=Folder, help="New folder for the refined recording (default: in place).")
+@click.pass_obj
+def resync(verbose: bool, recording: Path, output: Path | None) -> None:
+    """Refine the times of a recording by all that is known after its end.
+
+    While recording, a stamp can only use what has come so far; now each one uses the arrivals before and after it.
+    `record` does this by itself. In place, what was stamped while recording is kept: raw/data.online.jsonl holds the
+    lines, the tables in raw/ ticks, arrivals and stamps. With -o the files that do not change are shared with the old
+    recording (hard links).
+
+    \b
+    Examples:
+      rigtape resync demo/2026-11-22T10-00-00Z
+      rigtape resync demo/2026-11-22T10-00-00Z -o refined
+    """
+    console = Console()
+    with clear_errors(verbose):
+        _refine(recording, output, console)
+    console.print(f"next: rigtape check {output or recording}", soft_wrap=True)
 
 
 @main.command()

@@ -234,7 +234,13 @@ class _Decoding:
         start_ns = self._tape.start_ns if self._tape else first_ns - LEAD_NS
         device = self._device
         summary = DeviceSummary(
-            device.config.driver, device.clock, device.config.latency_s, self._driver.identity, self._summary
+            device.config.driver,
+            device.clock,
+            device.config.latency_s,
+            self._driver.identity,
+            self._summary,
+            self._driver.tick_hz,
+            self._driver.wrap_bits,
         )
         entry = {key: value for key, value in msgspec.to_builtins(device.config).items() if value is not None}
         manifest = new_manifest(

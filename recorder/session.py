@@ -222,6 +222,8 @@ class Take:
             latency_s=device.config.latency_s,
             identity=self._drivers[device.name].identity,
             stream=self._devices[device.name].summary,
+            tick_hz=self._drivers[device.name].tick_hz,
+            wrap_bits=self._drivers[device.name].wrap_bits,
         )
 
     # -- threads --

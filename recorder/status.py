@@ -137,3 +137,20 @@ def print_summary(console: Console, manifest: Manifest) -> None:
         )  # fmt: skip
         table.add_row(name, stream.kind, *map(str, counts))
     console.print(table)
+
+
+def print_refinement(console: Console, manifest: Manifest, took_s: float) -> None:
+    """How far the times of each clock were moved by refinement."""
+    resync = manifest.resync
+    if resync is None:
+        return
+    table = Table(box=None, pad_edge=False)
+    table.add_column("clock")
+    for column in ("moved by us (rms)", "from", "to", "uncertainty us"):
+        table.add_column(column, justify="right")
+    for name, clock in resync.clocks.items():
+        numbers = (clock.shift_rms_us, clock.shift_min_us, clock.shift_max_us, clock.uncertainty_us)
+        table.add_row(name, *(f"{number:.1f}" for number in numbers))
+    console.print(table)
+    kept = f"; {resync.kept} keep theirs, as no clock is known for them" if resync.kept else ""
+    console.print(f"times of {resync.lines} lines refined in {took_s:.1f} s{kept}")

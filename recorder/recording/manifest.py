@@ -39,13 +39,18 @@ class StreamSummary(msgspec.Struct, omit_defaults=False):
 
 
 class DeviceSummary(msgspec.Struct):
-    """One device of the rig: its driver, what it said of itself, its clock, and its stream's counts."""
+    """One device of the rig: its driver, what it said of itself, its clock, and its stream's counts.
+
+    tick_hz, wrap_bits: the unit of its ticks in raw/DEVICE.clock; null: that of its clock.
+    """
 
     driver: str
     clock: str
     latency_s: float
     identity: dict[str, str]
     stream: StreamSummary
+    tick_hz: float | None = None
+    wrap_bits: int = 0
 
 
 class ClockSummary(msgspec.Struct):
@@ -68,6 +73,39 @@ class UtcAtZero(msgspec.Struct):
     source: str
 
 
+class ClockRefinement(msgspec.Struct):
+    """What refinement did to the stamps of one clock, points of scans among them.
+
+    uncertainty_us: one sigma of a refined stamp, apart from the constant least delay of the link; from the difference
+    of two halves of the messages. shift_*: refined minus online stamp.
+    """
+
+    devices: list[str]
+    epochs: int
+    skew_ppm: float
+    uncertainty_us: float
+    shift_mean_us: float
+    shift_rms_us: float
+    shift_min_us: float
+    shift_max_us: float
+
+
+class Resync(msgspec.Struct):
+    """How the times were refined after the take.
+
+    state: running while it is done in place (and after it was cut short: resync again finishes it). lines: of
+    data.jsonl; kept: of these, with their online time, as no clock is known for them.
+    """
+
+    state: Literal["running", "done"]
+    method: str
+    at_utc: str
+    version: str
+    clocks: dict[str, ClockRefinement]
+    lines: int = 0
+    kept: int = 0
+
+
 class FileEntry(msgspec.Struct):
     """Size and SHA-256 of one file of a finished recording."""
 
@@ -81,7 +119,7 @@ class Manifest(msgspec.Struct, kw_only=True):
     state: recording while the take runs; complete after an orderly end; recovered after repair.
     stopped_by: why the take ended (duration, interrupt, disk low, an error's text); null while it runs.
     start_monotonic_ns: the host's monotonic clock at recording time 0 (times in raw/ are on that clock).
-    cameras: device names in the order of cameraInd.
+    cameras: device names in the order of cameraInd. resync: null as long as the times are those given online.
     """
 
     format: str = "rigtape-1"
@@ -98,6 +136,7 @@ class Manifest(msgspec.Struct, kw_only=True):
     rig: dict[str, Any]
     versions: dict[str, str]
     host: dict[str, str]
+    resync: Resync | None = None
     files: dict[str, FileEntry] = {}
 
 
