@@ -19,6 +19,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ METHOD = "two-sided over the whole recording: polling grid where trusted, else l
 FRAME_STEP_NS = 1000
 SCAN_MARGIN_NS = 1_000_000
 PROGRESS_LINES = 2000
+FIRST_LINES = 5000
 
 Progress = Callable[[float], None]
 
@@ -78,12 +80,14 @@ def resync(folder: Path, out: Path | None = None, progress: Progress = lambda do
         else:
             times_ns, summary = _refine(tables, manifest)
         target = _Target(folder, out)
-        manifest.resync = msgspec.structs.replace(summary, state="running")
-        target.begin(manifest, {device: _rows_bytes(times) for device, times in times_ns.items()})
         rewriting = _Rewriting(folder, target, manifest, tables, times_ns, former)
-        rewriting.run(progress)
-        manifest.resync = msgspec.structs.replace(summary, state="done", lines=rewriting.lines, kept=rewriting.kept)
-        target.finish(manifest)
+        rewriting.check_tables()
+        manifest.resync = msgspec.structs.replace(summary, state="running")
+        with target:
+            target.begin(manifest, {device: _rows_bytes(times) for device, times in times_ns.items()})
+            rewriting.run(progress)
+            manifest.resync = msgspec.structs.replace(summary, state="done", lines=rewriting.lines, kept=rewriting.kept)
+            target.finish(manifest)
     except OSError as error:
         raise StorageError(f"{out or folder}: cannot be refined: {error}") from error
     return manifest
@@ -198,6 +202,14 @@ class _Target:
         self._entries: dict[str, FileEntry] = {}
         self._data: HashedFile | None = None
 
+    def __enter__(self) -> "_Target":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._data is not None:  # it was not finished
+            self._data.close()
+            (self._folder / f"{DATA_NAME}.tmp").unlink(missing_ok=True)
+
     def begin(self, manifest: Manifest, refined: dict[str, bytes]) -> None:
         """Keep the refined times, and say that the work has begun."""
         if not self._in_place:
@@ -250,6 +262,7 @@ class _Target:
         assert self._data is not None
         online, data = self._folder / ONLINE_NAME, self._folder / DATA_NAME
         self._entries[DATA_NAME] = self._data.close()
+        self._data = None
         if (self._folder / LIDAR_FOLDER).is_dir():
             sync_folder(self._folder / LIDAR_FOLDER)
         if not online.exists():
@@ -286,16 +299,19 @@ class _LineTimes:
         self._rows: list[tuple[str, int]] = [rows[index] for index in order.tolist()] if rows is not None else []
         self._next: dict[str, int] = {}
 
+    def has(self, online_ns: int) -> bool:
+        """Whether there is a row with this stamp."""
+        place = bisect_left(self._online_ns, online_ns)
+        return place < len(self._online_ns) and self._online_ns[place] == online_ns
+
     def find(self, stream: str, online_ns: int) -> int | None:
         """Place of the row of the stream's next line with this stamp; None where there is none."""
         begin = self._next.get(stream, 0)
         place = bisect_left(self._online_ns, online_ns, begin)
         if place == len(self._online_ns) or self._online_ns[place] != online_ns:
-            place = bisect_left(self._online_ns, online_ns)  # more lines than rows of this stamp: the first one again
-            if place == len(self._online_ns) or self._online_ns[place] != online_ns:
-                return None
-        else:
-            self._next[stream] = place + 1
+            # more lines than rows of this stamp: the first one again
+            return bisect_left(self._online_ns, online_ns) if self.has(online_ns) else None
+        self._next[stream] = place + 1
         return place
 
     def time_ns(self, place: int) -> int:
@@ -364,9 +380,17 @@ class _Rewriting:
                 floor_ns = self._write(*heapq.heappop(waiting))
         while waiting:
             self._write(*heapq.heappop(waiting))
-        if self.lines and self.kept == self.lines:
-            raise StorageError(f"{self._folder}: no line of {DATA_NAME} is in the clock tables: they belong elsewhere")
         progress(1.0)
+
+    def check_tables(self) -> None:
+        """Raises StorageError when none of the first lines is in the tables."""
+        first = list(islice(self._read(lambda done: None), FIRST_LINES))
+        for online_ns, line in first:
+            times = self._times.get(_kind(line)[0])
+            if times is not None and times.has(online_ns):
+                return
+        if first:
+            raise StorageError(f"{self._folder}: no line of {DATA_NAME} is in the clock tables: they belong elsewhere")
 
     def _read(self, progress: Progress) -> Iterator[tuple[int, dict[str, Any]]]:
         path = self._folder / ONLINE_NAME
