@@ -29,6 +29,7 @@ from recorder.recording.info import print_info
 from recorder.resync import resync as resync_recording
 from recorder.rig import Rig, load_rig, parse_rig
 from recorder.session import record as record_take
+from recorder.skews import SkewStore, default_path
 from recorder.status import DecodeProgress, StatusDisplay, print_refinement, print_summary
 
 RigFile = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -111,6 +112,7 @@ def record(
             stop=stop,
             on_status=display.show,
             on_event=display.event,
+            skews=None if simulate else SkewStore(default_path()),
         )
     print_summary(console, manifest)
     if refine and manifest.state == "complete":

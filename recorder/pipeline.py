@@ -24,7 +24,7 @@ from drivers.samples import (
     ScanSample,
 )
 from recorder.clock import ClockMap
-from recorder.recording.manifest import NS_PER_S, ClockSummary, StreamSummary
+from recorder.recording.manifest import NS_PER_S, ClockState, ClockSummary, EpochSummary, StreamSummary
 from recorder.recording.raw import NONE, scan_rows
 from recorder.recording.writer import RecordingWriter
 from recorder.synchronizer import FrameSet, Released, Synchronizer
@@ -32,13 +32,16 @@ from recorder.timebase import HOLD_AT_START_NS, Stamped, Timebase
 
 WINDOW_NS = 500_000_000
 PAIRS_EVERY_NS = 500_000_000
+LOG_EVERY_NS = 1_000_000_000
+MAX_EPOCHS_KEPT = 1000
 
 
 @dataclass(slots=True)
 class DeviceInTake:
     """What the pipeline must know of one device, and its counts.
 
-    camera: index of its video, None for other devices. last_host_ns: time of its newest stamped sample.
+    camera: index of its video, None for other devices. prior_skew_ppm: skew and sigma of its clock, where known before.
+    last_host_ns: time of its newest stamped sample.
     """
 
     name: str
@@ -48,6 +51,7 @@ class DeviceInTake:
     wrap_bits: int
     camera: int | None
     summary: StreamSummary
+    prior_skew_ppm: tuple[float, float] | None = None
     last_host_ns: int = 0
     wait_for_keyframe: bool = True
     last_picture_ns: int = -1
@@ -82,20 +86,39 @@ class Pipeline:
     """Takes samples of all devices and writes them in their order."""
 
     def __init__(
-        self, writer: RecordingWriter, devices: list[DeviceInTake], start_ns: int, pair_within_ns: int
+        self,
+        writer: RecordingWriter,
+        devices: list[DeviceInTake],
+        start_ns: int,
+        pair_within_ns: int,
+        *,
+        inline_refit: bool = True,
     ) -> None:
-        """start_ns: host time of recording time 0."""
+        """start_ns: host time of recording time 0. inline_refit: False when another thread calls `refit` often."""
         self._writer = writer
         self._start_ns = start_ns
         self._devices = {device.name: device for device in devices}
-        self._timebase = Timebase(start_ns)
+        self._timebase = Timebase(start_ns, inline_refit=inline_refit)
         for device in devices:
             latency_ns = round(device.config.latency_s * NS_PER_S)
-            self._timebase.add_device(device.name, device.clock, device.tick_hz, device.wrap_bits, latency_ns)
+            prior = device.prior_skew_ppm
+            self._timebase.add_device(device.name, device.clock, device.tick_hz, device.wrap_bits, latency_ns, prior)
         cameras = sum(device.camera is not None for device in devices)
         self._synchronizer: Synchronizer[Stamped, FrameSample] = Synchronizer(cameras, pair_within_ns)
         self._tables = {device.name: _ClockTable() for device in devices}
-        self._last_pairs_ns = start_ns
+        self._last_pairs_ns = self._last_log_ns = start_ns
+        self._heard: set[str] = set()  # clocks that something came of
+        self._epochs: dict[str, list[EpochSummary]] = {}
+
+    def refit(self) -> None:
+        """Bring the clock maps up to date; for a thread of its own when `inline_refit` is False."""
+        self._timebase.refit()
+
+    def host_suspended(self, duration_ns: int, now_ns: int) -> None:
+        """The host slept: its monotonic clock stood still while the devices ran on."""
+        self._timebase.host_suspended(duration_ns, now_ns)
+        text = f"the host slept for {duration_ns / NS_PER_S:.3f} s: all clocks begin a new sync epoch"
+        self._writer.events.write("host", "suspend", text)
 
     def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
         """Feed one sample with its arrival on the host's monotonic clock."""
@@ -104,6 +127,7 @@ class Pipeline:
             self._tables[device].batches.append(np.column_stack((sample.ticks, sample.arrival_ns, none)))
         else:
             self._devices[device].summary.received += 1
+        self._heard.add(self._devices[device].clock)
         self._timebase.take(device, arrival_ns, sample)
 
     def _place(self, stamped: Stamped) -> None:
@@ -156,6 +180,26 @@ class Pipeline:
         if now_ns - self._last_pairs_ns >= PAIRS_EVERY_NS:
             self._last_pairs_ns = now_ns
             self._write_tables()
+        if now_ns - self._last_log_ns >= LOG_EVERY_NS:
+            self._last_log_ns = now_ns
+            self._log_clocks(now_ns)
+
+    def _log_clocks(self, now_ns: int) -> None:
+        """What is known of each clock now: each second into raw/clocks.jsonl, by epochs into recording.json."""
+        time_s = round((now_ns - self._start_ns) / NS_PER_S, 3)
+        for name, clock in self._timebase.clocks().items():
+            if name not in self._heard:
+                continue
+            skew_ppm, uncertainty_us = round(clock.skew_ppm, 4), round(clock.uncertainty_ns / 1e3, 3)
+            self._writer.write_clock(ClockState(time_s, name, clock.epoch, skew_ppm, uncertainty_us))
+            epochs = self._epochs.setdefault(name, [])
+            if not epochs or epochs[-1].epoch != clock.epoch:
+                if len(epochs) >= MAX_EPOCHS_KEPT:
+                    continue
+                epochs.append(EpochSummary(clock.epoch, time_s, time_s, skew_ppm, uncertainty_us))
+            else:
+                last = epochs[-1]
+                last.until_s, last.skew_ppm, last.uncertainty_us = time_s, skew_ppm, uncertainty_us
 
     def finish(self) -> None:
         """Write all that is left."""
@@ -207,10 +251,17 @@ class Pipeline:
     def clock_summaries(self) -> dict[str, ClockSummary]:
         """Each clock as its map sees it now."""
         ticks = {device.clock: (device.tick_hz, device.wrap_bits) for device in reversed(list(self._devices.values()))}
-        return {name: _clock_summary(clock, *ticks[name]) for name, clock in self._timebase.clocks().items()}
+        return {
+            name: _clock_summary(clock, *ticks[name], self._epochs.get(name, []))
+            for name, clock in self._timebase.clocks().items()
+        }
+
+    def skews_ppm(self) -> dict[str, tuple[float, float]]:
+        """Skew and sigma of each clock as known now."""
+        return {name: (clock.skew_ppm, clock.skew_sigma_ppm) for name, clock in self._timebase.clocks().items()}
 
 
-def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int) -> ClockSummary:
+def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int, epochs: list[EpochSummary]) -> ClockSummary:
     return ClockSummary(
         tick_hz=tick_hz,
         wrap_bits=wrap_bits,
@@ -220,6 +271,7 @@ def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int) -> ClockSumm
         duplicates=clock.duplicates,
         resets=clock.resets,
         wraps=clock.wraps,
+        by_epoch=epochs,
     )
 
 

@@ -4,6 +4,7 @@
                                    │
                                    ▼ inbox (bounded by bytes; a drop is counted, never silent)
     merge thread:              Pipeline: clock maps ──▶ synchronizer ──▶ recording writer ──▶ writer threads
+    clocks thread:             works the lines of the clock maps out anew, which takes some milliseconds
     calling thread:            watches the disk and the clock, shows the status, stops
 
 A device that is lost is taken up again by its own thread; an error of a writer ends the take, with everything closed.
@@ -27,6 +28,7 @@ from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, Strea
 from recorder.recording.work import ByteQueue
 from recorder.recording.writer import RecordingWriter, new_manifest
 from recorder.rig import Rig, RigDevice
+from recorder.skews import Skew, SkewStore, device_key
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,9 @@ INBOX_BYTES = 256 << 20
 SAMPLE_BYTES = 300
 MERGE_EVERY_S = 0.02
 STATUS_EVERY_S = 0.5
+REFIT_EVERY_S = 0.02
+MIN_SUSPEND_NS = 20_000_000
+MIN_SKEW_TAKE_S = 30.0
 
 
 class DevicesMissingError(RecorderError):
@@ -78,11 +83,13 @@ def record(
     stop: threading.Event,
     on_status: OnStatus,
     on_event: OnEvent,
+    skews: SkewStore | None = None,
 ) -> tuple[Path, Manifest]:
     """Record one take of a rig until `stop` is set, the duration is over or the disk is low.
 
-    Gives the folder and its manifest. Raises RecorderError before anything was recorded: a bad calibration, an output
-    that can't hold a minute, required devices that are missing; StorageError when the files can't be finished.
+    skews: what is known of the devices' clocks from takes before; this take adds to it. Gives the folder and its
+    manifest. Raises RecorderError before anything was recorded: a bad calibration, an output that can't hold a minute,
+    required devices that are missing; StorageError when the files can't be finished.
     """
     drivers = {device.name: device.driver.create(device.name, device.config) for device in rig.devices}
     calibration = _calibration(rig, _cameras(rig, drivers))
@@ -91,7 +98,7 @@ def record(
     connected = _connect(rig, drivers, stop, on_event)
     try:
         folder = create_take_folder(out, name, time.time_ns())
-        take = Take(rig, drivers, connected, folder, calibration, bytes_per_s, on_event)
+        take = Take(rig, drivers, connected, folder, calibration, bytes_per_s, on_event, skews)
     except BaseException:
         for driver in drivers.values():
             driver.close()
@@ -174,12 +181,15 @@ class Take:
         calibration: bytes | None,
         bytes_per_s: float,
         on_event: OnEvent,
+        skews: SkewStore | None = None,
     ) -> None:
         """Time 0 is now: the files are created, and the devices are read from `run` on."""
         self._drivers = drivers
         self._connected = set(connected)
         self._bytes_per_s = bytes_per_s
         self._on_event = on_event
+        self._skews = skews
+        self._stop_refitting = threading.Event()
         self._stop_reading = threading.Event()
         self._failure: str | None = None
         self._is_merged = False
@@ -196,8 +206,13 @@ class Take:
             raw=rig.raw,
             on_error=self._writer_failed,
         )
+        self._take_up_skews()
         self._pipeline = Pipeline(
-            self._writer, list(self._devices.values()), self._start_ns, _half_period_ns(cameras, drivers)
+            self._writer,
+            list(self._devices.values()),
+            self._start_ns,
+            _half_period_ns(cameras, drivers),
+            inline_refit=False,
         )
         self._folder = folder
         self._last_counts: dict[str, int] = {}
@@ -235,7 +250,8 @@ class Take:
             for name in self._devices
         ]
         merger = threading.Thread(target=self._guard, args=("merge", self._merge), name="merge", daemon=True)
-        for thread in (*readers, merger):
+        refitter = threading.Thread(target=self._guard, args=("clocks", self._refit), name="clocks", daemon=True)
+        for thread in (*readers, merger, refitter):
             thread.start()
         stopped_by = "error"
         try:
@@ -247,6 +263,8 @@ class Take:
                 thread.join()
             self._inbox.close()
             merger.join()
+            self._stop_refitting.set()
+            refitter.join()
             manifest = self._finish(end_ns, stopped_by)
         return manifest
 
@@ -304,14 +322,66 @@ class Take:
 
     def _merge(self) -> None:
         """Feed the pipeline in order of arrival."""
+        slept_ns, awake_ns = suspended_ns(), time.monotonic_ns()
         while not self._inbox.ended:
-            for name, item in self._inbox.get_all(MERGE_EVERY_S):
-                for arrival_ns, sample in item.samples:
-                    self._pipeline.take(name, arrival_ns, sample)
+            items = self._inbox.get_all(MERGE_EVERY_S)
+            now_slept_ns, now_ns = suspended_ns(), time.monotonic_ns()
+            if now_slept_ns - slept_ns > MIN_SUSPEND_NS:
+                items = self._feed(items, until_ns=awake_ns)
+                self._pipeline.host_suspended(now_slept_ns - slept_ns, now_ns)
+                slept_ns = now_slept_ns
+            awake_ns = now_ns
+            self._feed(items)
             self._pipeline.advance(time.monotonic_ns())
             time.sleep(MERGE_EVERY_S)  # collects samples: the order of streams needs no haste
         self._pipeline.finish()
         self._is_merged = True
+
+    def _feed(self, items: list[tuple[str, Received]], until_ns: int | None = None) -> list[tuple[str, Received]]:
+        """Hand samples to the pipeline; those that came after `until_ns` are given back."""
+        left = []
+        for name, item in items:
+            for arrival_ns, sample in item.samples:
+                if until_ns is None or arrival_ns <= until_ns:
+                    self._pipeline.take(name, arrival_ns, sample)
+                else:
+                    left.append((name, Received(samples=((arrival_ns, sample),))))
+        return left
+
+    def _refit(self) -> None:
+        """Keep the clock maps up to date, off the way of the samples."""
+        while not self._stop_refitting.wait(REFIT_EVERY_S):
+            self._pipeline.refit()
+
+    # -- skews of the devices' clocks --
+
+    def _skew_keys(self) -> dict[str, tuple[str, str]]:
+        """Clock -> (device, key in the store), of the first device on each that has a serial number."""
+        keys: dict[str, tuple[str, str]] = {}
+        for name, device in self._devices.items():
+            key = device_key(device.config.driver, self._drivers[name].identity)
+            if key is not None:
+                keys.setdefault(device.clock, (name, key))
+        return keys
+
+    def _take_up_skews(self) -> None:
+        if self._skews is None:
+            return
+        now_s = time.time()
+        for clock, (_, key) in self._skew_keys().items():
+            for device in self._devices.values():
+                if device.clock == clock:
+                    device.prior_skew_ppm = self._skews.prior(key, now_s)
+
+    def _keep_skews(self, duration_s: float) -> None:
+        if self._skews is None or duration_s < MIN_SKEW_TAKE_S:
+            return
+        known, now_s = self._pipeline.skews_ppm(), time.time()
+        found = {key: Skew(*known[clock], now_s) for clock, (_, key) in self._skew_keys().items() if clock in known}
+        try:
+            self._skews.keep(found)
+        except OSError as error:  # the take itself is not concerned
+            log.warning("clock skews not kept: %s", error)
 
     # -- the calling thread --
 
@@ -363,7 +433,23 @@ class Take:
         faults = self._writer.close(end_ns - self._start_ns, stopped_by, complete=self._is_merged)
         if faults:
             raise StorageError(f"{self._folder}: could not be finished: {'; '.join(faults)}")
+        self._keep_skews((end_ns - self._start_ns) / NS_PER_S)
         return self._manifest
+
+
+def suspended_ns() -> int:
+    """How long the host has slept since it was started (Linux; elsewhere 0)."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):
+        return 0
+    readings = []
+    for _ in range(5):  # a thread may lose the processor between two readings: the quickest pair counts
+        before_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+        boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        after_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+        readings.append((after_ns - before_ns, boot_ns - before_ns))
+        if after_ns - before_ns < 100_000:
+            break
+    return min(readings)[1]
 
 
 def _in_take(device: RigDevice, driver: Driver, cameras: list[RigDevice]) -> DeviceInTake:

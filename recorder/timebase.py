@@ -7,6 +7,7 @@ taken off its arrivals, which is the same as taking it off the mapped times and 
 share a clock.
 """
 
+import threading
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,7 @@ from recorder.clock import ClockMap, ClockStream
 
 HOLD_AT_START_NS = 1_000_000_000
 HOLD_NS = 400_000_000
+UNKNOWN_SKEW_PPM = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,24 +54,45 @@ class _Clock:
     map: ClockMap
     hold_until_ns: int
     epoch: int = -1  # none yet
+    is_new: bool = True
     waiting: list[tuple[_DeviceStream, int, int, Sample]] = field(default_factory=list)
 
 
 class Timebase:
-    """All clocks of a rig. Not thread safe: one thread feeds it."""
+    """All clocks of a rig. Not thread safe but for `refit`: one thread feeds it."""
 
-    def __init__(self, start_ns: int) -> None:
-        """start_ns: host time of the take's start; nothing is stamped before HOLD_AT_START_NS after it."""
+    def __init__(self, start_ns: int, *, inline_refit: bool = True) -> None:
+        """start_ns: host time of the take's start; nothing is stamped before HOLD_AT_START_NS after it.
+
+        inline_refit: False when another thread calls `refit` often.
+        """
         self._start_ns = start_ns
+        self._inline_refit = inline_refit
+        self._refitting = threading.Lock()
         self._clocks: dict[str, _Clock] = {}
         self._streams: dict[str, _DeviceStream] = {}
         self._unclocked: list[Stamped] = []  # of devices that send no time
         self._epochs_begun: list[tuple[str, int]] = []
 
-    def add_device(self, device: str, clock: str, tick_hz: float, wrap_bits: int, latency_ns: int) -> None:
-        """Announce a device and the clock that stamps it."""
+    def add_device(
+        self,
+        device: str,
+        clock: str,
+        tick_hz: float,
+        wrap_bits: int,
+        latency_ns: int,
+        prior_skew_ppm: tuple[float, float] | None = None,
+    ) -> None:
+        """Announce a device and the clock that stamps it. prior_skew_ppm: its skew and sigma, where known before."""
         if clock not in self._clocks:
-            clock_map = ClockMap(tick_hz, wrap_bits)
+            skew_ppm, sigma_ppm = prior_skew_ppm or (0.0, UNKNOWN_SKEW_PPM)
+            clock_map = ClockMap(
+                tick_hz,
+                wrap_bits,
+                prior_skew_ppm=skew_ppm,
+                prior_sigma_ppm=sigma_ppm,
+                inline_refit=self._inline_refit,
+            )
             self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS)
         shared = self._clocks[clock]
         self._streams[device] = _DeviceStream(
@@ -79,6 +102,24 @@ class Timebase:
     def clocks(self) -> dict[str, ClockMap]:
         """The clock maps by name, for status and manifest."""
         return {name: clock.map for name, clock in self._clocks.items()}
+
+    def refit(self) -> None:
+        """Work out anew what is due; a few ms each, in any thread."""
+        for clock in self._clocks.values():
+            self._refit(clock)
+
+    def _refit(self, clock: _Clock) -> None:
+        with self._refitting:
+            if clock.map.refit_due:
+                clock.map.refit()
+
+    def host_suspended(self, duration_ns: int, now_ns: int) -> None:
+        """The host slept for so long while the devices ran on; what came before has been taken."""
+        for clock in self._clocks.values():
+            clock.map.host_suspended(duration_ns)
+            clock.epoch = clock.map.epoch
+            clock.is_new = True
+            clock.hold_until_ns = max(clock.hold_until_ns, now_ns + HOLD_NS)
 
     def epochs_begun(self) -> list[tuple[str, int]]:
         """Clocks (with their epoch) that began a new sync epoch since this was last called."""
@@ -107,18 +148,23 @@ class Timebase:
                 self._epochs_begun.append((clock.name, clock.map.epoch))
             clock.epoch = clock.map.epoch
             clock.hold_until_ns = max(clock.hold_until_ns, arrival_ns + HOLD_NS)
+            clock.is_new = True
 
     def release(self, now_ns: int) -> list[Stamped]:
         """All samples fed so far but those of an epoch that is too young; those of one device in order."""
         stamped, self._unclocked = self._unclocked, []
         for clock in self._clocks.values():
             if now_ns >= clock.hold_until_ns:
+                if clock.is_new and clock.waiting:  # its first stamps are to know all that came
+                    self._refit(clock)
+                    clock.is_new = False
                 waiting, clock.waiting = clock.waiting, []
                 stamped.extend(self._stamp(*sample) for sample in waiting)
         return stamped
 
     def flush(self) -> list[Stamped]:
         """All samples that are left: the end of a take."""
+        self.refit()
         return self.release(max((clock.hold_until_ns for clock in self._clocks.values()), default=0))
 
     def _stamp(self, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:

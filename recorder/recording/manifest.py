@@ -53,6 +53,29 @@ class DeviceSummary(msgspec.Struct):
     wrap_bits: int = 0
 
 
+class ClockState(msgspec.Struct):
+    """A line of raw/clocks.jsonl: one clock as known at a time of the take.
+
+    uncertainty_us: one sigma of the stamps given then, apart from the constant least delay of the link.
+    """
+
+    time: float
+    clock: str
+    epoch: int
+    skew_ppm: float
+    uncertainty_us: float
+
+
+class EpochSummary(msgspec.Struct):
+    """One sync epoch of a clock, to the second; skew and uncertainty as known at its end."""
+
+    epoch: int
+    from_s: float
+    until_s: float
+    skew_ppm: float
+    uncertainty_us: float
+
+
 class ClockSummary(msgspec.Struct):
     """One device clock as the clock map saw it at the end."""
 
@@ -64,6 +87,7 @@ class ClockSummary(msgspec.Struct):
     duplicates: int
     resets: int
     wraps: int
+    by_epoch: list[EpochSummary] = []
 
 
 class UtcAtZero(msgspec.Struct):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -32,6 +33,7 @@ from recorder.recording.manifest import (
     EVENTS_NAME,
     MANIFEST_NAME,
     NS_PER_S,
+    ClockState,
     ClockSummary,
     DeviceSummary,
     EventLog,
@@ -42,11 +44,13 @@ from recorder.recording.manifest import (
     write_atomically,
     write_manifest,
 )
+from recorder.recording.raw import FOLDER as RAW_FOLDER
 from recorder.recording.raw import RawWriter
 from recorder.recording.video import VideoWriter, video_name
-from recorder.recording.work import Ticket
+from recorder.recording.work import HashedFile, Ticket
 
 CALIBRATION_NAME = "calibration.json"
+CLOCK_LOG_NAME = f"{RAW_FOLDER}/clocks.jsonl"
 OnError = Callable[[str, Exception], None]
 
 
@@ -70,11 +74,13 @@ class RecordingWriter:
     ) -> None:
         """Create all files in an existing, empty folder. monotonic_ns: the clock that stamps events."""
         self._faults: list[str] = []
+        self._clock_log: HashedFile | None = None
 
         def failed(name: str, error: Exception) -> None:
             self._faults.append(f"{name}: {error}")
             on_error(name, error)
 
+        self._failed: OnError = failed
         self.folder = folder
         self.manifest = manifest
         start_ns = manifest.start_monotonic_ns
@@ -142,6 +148,16 @@ class RecordingWriter:
             pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None))
         self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
 
+    def write_clock(self, state: ClockState) -> None:
+        """A line of raw/clocks.jsonl, on its way to the disk at once."""
+        try:
+            if self._clock_log is None:
+                self._clock_log = HashedFile(self.folder / CLOCK_LOG_NAME)
+            self._clock_log.write(msgspec.json.encode(state) + b"\n")
+            self._clock_log.flush()
+        except OSError as error:
+            self._failed("clocks", error)
+
     def close(self, duration_ns: int, stopped_by: str, *, complete: bool = True) -> list[str]:
         """Finish all files; recording.json says complete last of all, unless a file could not be written or finished.
 
@@ -161,6 +177,8 @@ class RecordingWriter:
                 except OSError as error:
                     faults.append(f"{type(closer).__name__}: {error}")
         try:
+            if self._clock_log is not None:
+                files[CLOCK_LOG_NAME] = self._clock_log.close()
             self.events.close()
             small = [CALIBRATION_NAME, EVENTS_NAME, *(video_name(index) for index in range(len(self.videos)))]
             files |= {name: hash_file(self.folder / name) for name in small if (self.folder / name).exists()}

@@ -443,6 +443,7 @@ class Recorded:
         self.videos = ([], [])
         self.events = SimpleNamespace(write=lambda *_: None)
         self.raw = SimpleNamespace(put_clock_rows=lambda *_: None)
+        self.write_clock = lambda _: None
 
     def write_frames(self, time_ns, frames, *, late):
         for video, frame in zip(self.videos, frames, strict=True):

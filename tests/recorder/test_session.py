@@ -20,8 +20,10 @@ from recorder.errors import ConfigError, StorageError, StorageFullError
 from recorder.pipeline import Pipeline
 from recorder.recording.check import check
 from recorder.recording.manifest import hash_file, read_manifest
+from recorder.recording.raw import read_clock_table
 from recorder.rig import Rig, RigDevice
 from recorder.session import DevicesMissingError, record
+from recorder.skews import Skew, SkewStore
 
 MS = 1_000_000
 DELAY_NS = 3 * MS
@@ -141,7 +143,7 @@ class Bench:
         self._devices.append(RigDevice(name, DriverType(FakeConfig, lambda name, config: self.drivers[name]), config))
         return driver
 
-    def record(self, *, duration_s=None, stop=None, name="take"):
+    def record(self, *, duration_s=None, stop=None, name="take", skews=None):
         rig = Rig("bench", tuple(self._devices), self.calibration, True, {"name": "bench", "devices": {}})
         if stop is None:
             stop = threading.Event()
@@ -154,6 +156,7 @@ class Bench:
             stop=stop,
             on_status=self.told.statuses.append,
             on_event=lambda device, event: self.told.events.append((device, event)),
+            skews=skews,
         )
 
     def _stop_when_played(self, stop):
@@ -519,3 +522,62 @@ def test_a_stop_before_the_take_began_records_nothing(bench):
         bench.record(stop=stop)
     assert list(bench.out.iterdir()) == []
     assert driver.closed
+
+
+# -- clocks --
+
+
+def test_what_is_known_of_each_clock_is_written_down(bench, read_lines):
+    """One line a second and clock, and a summary by epochs."""
+    bench.add("imu", imu_act(300))
+    bench.add("pose", pose_act(100))
+    folder, manifest = bench.record(duration_s=2.3, stop=threading.Event())
+    log = read_lines(folder, "raw/clocks.jsonl")
+    assert [line["clock"] for line in log].count("imu") == [line["clock"] for line in log].count("pose") == 2
+    assert all(line["uncertainty_us"] > 0 and line["epoch"] == 0 for line in log)
+    (epoch,) = manifest.clocks["imu"].by_epoch
+    assert (epoch.epoch, epoch.from_s, epoch.until_s) == (0, log[0]["time"], log[-1]["time"])
+
+
+def test_a_host_that_slept_begins_new_epochs(bench, monkeypatch):
+    """The devices' clocks run on while the host's stands still."""
+    slept_ns = 7 * 1_000_000_000
+    slept = [0]
+    monkeypatch.setattr(recorder.session, "suspended_ns", lambda: slept[0])
+
+    def act():
+        for index in range(400):
+            if index == 200:
+                time.sleep(0.05)
+                slept[0] = slept_ns
+            arrival_ns = time.monotonic_ns()
+            sample = ImuSample(None, arrival_ns - DELAY_NS + slept[0], (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
+            yield Received(samples=((arrival_ns, sample),))
+            time.sleep(0.005)
+
+    bench.add("imu", act)
+    folder, manifest = bench.record()
+    (event,) = [event for event in events_of(folder) if event["device"] == "host"]
+    assert event["kind"] == "suspend"
+    assert "7.000 s" in event["text"]
+    assert manifest.clocks["imu"].epochs == 2
+    rows = read_clock_table(folder / "raw" / "imu.clock")
+    delay_ns = rows[:, 1] - manifest.start_monotonic_ns - rows[:, 2]
+    assert (delay_ns >= 0).all()
+    assert np.median(delay_ns) < 3 * MS
+
+
+def test_the_hosts_sleep_is_read_from_its_clocks():
+    first, second = recorder.session.suspended_ns(), recorder.session.suspended_ns()
+    assert abs(second - first) < 5 * MS
+
+
+def test_skews_of_devices_are_kept_and_taken_up(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder.session, "MIN_SKEW_TAKE_S", 0.0)
+    path = tmp_path / "skews.json"
+    SkewStore(path).keep({"fake 17": Skew(42.0, 0.5, time.time())})
+    bench.add("imu", imu_act(20))
+    _, manifest = bench.record(skews=SkewStore(path))
+    assert manifest.clocks["imu"].skew_ppm == pytest.approx(42.0, abs=5)
+    kept = SkewStore(path).prior("fake 17", time.time())
+    assert kept[0] == pytest.approx(manifest.clocks["imu"].skew_ppm, abs=0.01)
