@@ -116,7 +116,7 @@ def _tape(path: Path, driver: str) -> _Tape | None:
     entry = manifest.rig.get("devices", {}).get(path.stem)
     if not isinstance(entry, dict) or entry.get("driver") != driver:
         return None
-    return _Tape(entry, manifest.utc_at_time_0.utc_ns)
+    return _Tape(entry, manifest.utc_at_time_0.by_host_ns)
 
 
 def _device(path: Path, driver: str, settings: tuple[str, ...], tape: _Tape | None) -> RigDevice:

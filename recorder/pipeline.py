@@ -29,6 +29,7 @@ from recorder.recording.raw import NONE, scan_rows
 from recorder.recording.writer import RecordingWriter
 from recorder.synchronizer import FrameSet, Released, Synchronizer
 from recorder.timebase import HOLD_AT_START_NS, Stamped, Timebase
+from recorder.utc import FixTimes, by_gnss, judge, utc_at_zero
 
 WINDOW_NS = 500_000_000
 PAIRS_EVERY_NS = 500_000_000
@@ -107,6 +108,8 @@ class Pipeline:
         self._synchronizer: Synchronizer[Stamped, FrameSample] = Synchronizer(cameras, pair_within_ns)
         self._tables = {device.name: _ClockTable() for device in devices}
         self._last_pairs_ns = self._last_log_ns = start_ns
+        self._judged: set[str] = set()  # clocks of which was told what they show
+        self._fixes: dict[str, FixTimes] = {}
         self._heard: set[str] = set()  # clocks that something came of
         self._epochs: dict[str, list[EpochSummary]] = {}
 
@@ -124,11 +127,35 @@ class Pipeline:
         """Feed one sample with its arrival on the host's monotonic clock."""
         if isinstance(sample, ClockPairs):
             none = np.full(sample.ticks.size, NONE, np.int64)
+            self._judge_clock(device, sample)
             self._tables[device].batches.append(np.column_stack((sample.ticks, sample.arrival_ns, none)))
         else:
             self._devices[device].summary.received += 1
         self._heard.add(self._devices[device].clock)
         self._timebase.take(device, arrival_ns, sample)
+
+    def _judge_clock(self, name: str, pairs: ClockPairs) -> None:
+        """Say once in each sync epoch which time a device that sends packets of its own time shows."""
+        device = self._devices[name]
+        if device.clock in self._judged or not pairs.ticks.size or device.wrap_bits:
+            return
+        self._judged.add(device.clock)
+        host_utc_ns = int(pairs.arrival_ns[0]) - self._start_ns + self._writer.manifest.utc_at_time_0.by_host_ns
+        kind, text = judge(int(pairs.ticks[0]) * NS_PER_S // round(device.tick_hz), host_utc_ns)
+        self._writer.events.write(name, kind, text)
+
+    def set_utc(self) -> None:
+        """UTC at time 0 by the fixes, if there are enough, and a word on the host's clock if it is off."""
+        for name, fixes in self._fixes.items():
+            device = self._devices[name]
+            sigma_s = self._timebase.clocks()[device.clock].uncertainty_ns / NS_PER_S
+            found = utc_at_zero(np.array(fixes.utc_ns), np.array(fixes.time_ns), sigma_s, device.config.latency_s)
+            if found is not None:
+                manifest = self._writer.manifest
+                manifest.utc_at_time_0, fault = by_gnss(manifest.utc_at_time_0, *found)
+                if fault:
+                    self._writer.events.write(name, "warning", fault)
+                return
 
     def _place(self, stamped: Stamped) -> None:
         device = self._devices[stamped.device]
@@ -139,6 +166,8 @@ class Pipeline:
             self._tables[stamped.device].rows.append((stamped.sample.device_ticks, stamped.arrival_ns, line_ns))
             return
         self._tables[stamped.device].add(stamped, time_ns, self._start_ns)
+        if isinstance(stamped.sample, FixSample) and stamped.sample.quality > 0:
+            self._fixes.setdefault(stamped.device, FixTimes()).add(stamped.sample.device_ticks, time_ns)
         if time_ns < 0:
             device.summary.before_start += 1
         else:
@@ -175,6 +204,7 @@ class Pipeline:
         for clock, epoch in self._timebase.epochs_begun():
             text = f"clock {clock} began sync epoch {epoch}: its device restarted, paused or jumped in time"
             self._writer.events.write(clock, "epoch", text)
+            self._judged.discard(clock)
         if now_ns - self._start_ns > HOLD_AT_START_NS + WINDOW_NS // 5:
             self._write(self._synchronizer.release(now_ns - WINDOW_NS - self._start_ns))
         if now_ns - self._last_pairs_ns >= PAIRS_EVERY_NS:

@@ -49,6 +49,7 @@ from recorder.recording.raw import FOLDER as RAW_FOLDER
 from recorder.recording.raw import SCAN_ROWS
 from recorder.recording.work import HashedFile
 from recorder.refinement import DeviceTable, Ints, Refined, ascending, load_table, refine_tables
+from recorder.utc import by_gnss, utc_at_zero
 
 ONLINE_NAME = f"{RAW_FOLDER}/data.online.jsonl"
 METHOD = "two-sided over the whole recording: polling grid where trusted, else lower envelope"
@@ -79,6 +80,7 @@ def resync(folder: Path, out: Path | None = None, progress: Progress = lambda do
             times_ns, summary = former, was
         else:
             times_ns, summary = _refine(tables, manifest)
+        _set_utc(manifest, tables, times_ns, summary)
         target = _Target(folder, out)
         rewriting = _Rewriting(folder, target, manifest, tables, times_ns, former)
         rewriting.check_tables()
@@ -157,6 +159,19 @@ def _refine(tables: dict[str, DeviceTable], manifest: Manifest) -> tuple[dict[st
         version=version("rigtape"),
         clocks=summaries,
     )
+
+
+def _set_utc(manifest: Manifest, tables: dict[str, DeviceTable], times_ns: dict[str, Ints], summary: Resync) -> None:
+    """UTC at time 0 anew, if fixes told it: from the same fixes with their refined times."""
+    if manifest.utc_at_time_0.source != "gnss":
+        return
+    for name, table in tables.items():
+        if manifest.devices[name].stream.kind == "gnss" and table.tick_hz == NS_PER_S:
+            sigmas_us = [clock.uncertainty_us for clock in summary.clocks.values() if name in clock.devices]
+            found = utc_at_zero(table.stamped[:, 0], times_ns[name], max(sigmas_us) / 1e6, table.latency_ns / NS_PER_S)
+            if found is not None:
+                manifest.utc_at_time_0, _ = by_gnss(manifest.utc_at_time_0, *found)
+                return
 
 
 def _summary(refined: Refined, tables: dict[str, DeviceTable]) -> ClockRefinement:

@@ -427,6 +427,7 @@ class Take:
     def _finish(self, end_ns: int, stopped_by: str) -> Manifest:
         for device, dropped in self._writer.raw.dropped_bytes.items():
             self._writer.events.write(device, "drop", f"the raw tape lost {dropped} bytes for want of room", dropped)
+        self._pipeline.set_utc()
         self._manifest.clocks = self._pipeline.clock_summaries()
         if self._failure is not None:
             stopped_by = f"error: {self._failure}"

@@ -91,10 +91,21 @@ class ClockSummary(msgspec.Struct):
 
 
 class UtcAtZero(msgspec.Struct):
-    """UTC at recording time 0, in nanoseconds since 1970, and how it is known."""
+    """UTC at recording time 0, in nanoseconds since 1970, and how it is known.
+
+    uncertainty_s: one sigma, where it can be told. host_clock_ns: the same by the host's clock, which the stamps of the
+    raw tapes go by; null: utc_ns is that.
+    """
 
     utc_ns: int
     source: str
+    uncertainty_s: float | None = None
+    host_clock_ns: int | None = None
+
+    @property
+    def by_host_ns(self) -> int:
+        """UTC at time 0 by the host's clock."""
+        return self.utc_ns if self.host_clock_ns is None else self.host_clock_ns
 
 
 class ClockRefinement(msgspec.Struct):

@@ -2,8 +2,9 @@
 
 raw/DEVICE.pcapng holds the bytes of a wire device with nanosecond time stamps and opens in Wireshark: datagrams as
 IPv4/UDP packets, serial chunks under a user link type (LINKTYPE_USER0; bytes we sent are marked outbound). Time stamps
-are UTC: the arrival on the host's monotonic clock plus a constant, `utc_at_time_0.utc_ns - start_monotonic_ns` of
-recording.json. Format: the pcapng Internet-Draft (draft-ietf-opsawg-pcapng), sections 4.1 to 4.3.
+are UTC by the host's clock: the arrival on its monotonic clock plus a constant, `utc_at_time_0.host_clock_ns` (where
+that is null, `utc_ns`) `- start_monotonic_ns` of recording.json. Format: the pcapng Internet-Draft
+(draft-ietf-opsawg-pcapng), sections 4.1 to 4.3.
 
 raw/DEVICE.clock is a table of little-endian int64, three to a row: device ticks, arrival in monotonic ns, and the stamp
 that was given online, in ns of recording time: the line's `time` is exactly stamp / 1e9. So each line can be traced to

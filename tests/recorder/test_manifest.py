@@ -52,7 +52,8 @@ def test_it_says_who_made_it_and_when(tmp_path):
     assert read["format"] == "rigtape-1"
     assert read["state"] == "recording"
     assert read["started_utc"] == "2023-11-14T22:13:20Z"
-    assert read["utc_at_time_0"] == {"utc_ns": 1_700_000_000_123_456_789, "source": "host clock"}
+    utc = {"utc_ns": 1_700_000_000_123_456_789, "source": "host clock", "uncertainty_s": None, "host_clock_ns": None}
+    assert read["utc_at_time_0"] == utc
     assert set(read["versions"]) == {"rigtape", "python", "av", "numpy"}
     assert read["stopped_by"] is None
 
