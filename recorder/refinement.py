@@ -171,7 +171,8 @@ def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int
         spans = np.concatenate([_spans(axes[table.device]) for table in group if len(table.heard)])
         order = np.lexsort((arrival_ns, axis, spans))
     host_ns = np.zeros_like(axis)
-    host_ns[order] = refine(axis[order], arrival_ns[order], NS_PER_S) if axis.size else axis
+    if axis.size:
+        host_ns[order] = refine(axis[order], arrival_ns[order], NS_PER_S)
     curves = _curves(axis[order], host_ns[order])
     times_ns = {}
     first = 0
@@ -229,13 +230,12 @@ def _stamped_times(
 
 
 def ascending(online_ns: Ints, times_ns: Ints, step_ns: int) -> Ints:
-    """The same times, each at least `step_ns` after that of the stamp before, none before 0."""
+    """The same times, each at least `step_ns` after that of the stamp before; lines of the take not before 0."""
     order = np.argsort(online_ns, kind="stable")
     steps = step_ns * np.arange(order.size, dtype=np.int64)
     pushed = np.empty_like(times_ns)
     pushed[order] = np.maximum.accumulate(times_ns[order] - steps) + steps
-    early = order[: np.searchsorted(pushed[order], 0)]  # just before the take, after all: they keep their order
-    pushed[early] = 0
+    pushed[(pushed < 0) & (online_ns >= 0)] = 0  # just before the take, after all: they keep their order
     return pushed
 
 

@@ -175,7 +175,10 @@ def _set_utc(manifest: Manifest, tables: dict[str, DeviceTable], times_ns: dict[
 
 
 def _summary(refined: Refined, tables: dict[str, DeviceTable]) -> ClockRefinement:
-    parts = [times - tables[device].stamped[:, 2] for device, times in refined.times_ns.items()]
+    parts = []
+    for device, times in refined.times_ns.items():
+        online_ns = tables[device].stamped[:, 2]
+        parts.append((times - online_ns)[online_ns >= 0])  # what came before the take is in no line
     shifts_us = np.concatenate(parts) / 1e3 if parts else np.zeros(0)
     if not shifts_us.size:
         shifts_us = np.zeros(1)
