@@ -130,7 +130,8 @@ def record(
 def _refine(folder: Path, out: Path | None, console: Console) -> None:
     """Refine the times of a recording, and tell by how much they moved."""
     begun_s = time.monotonic()
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    errors = Console(stderr=True)
+    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as bar:
         task = bar.add_task("refining the times", total=1.0)
         manifest = resync_recording(folder, out, lambda done: bar.update(task, completed=done))
     print_refinement(console, manifest, time.monotonic() - begun_s)

@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from drivers.samples import POINT_DTYPE
 from recorder.errors import StorageError
 from recorder.recording.check_data import STREAMS_OF_KIND, file_size, path_inside
-from recorder.recording.manifest import MANIFEST_NAME, NS_PER_S, ClockSummary, Manifest, read_manifest
+from recorder.recording.manifest import MANIFEST_NAME, NS_PER_S, ClockSummary, Manifest, Resync, read_manifest
 from recorder.recording.reader import DATA_NAME, BadLine, Streams, VideoStats, find_videos, read_lines, read_video
 
 KIND_OF_STREAM = {stream: kind for kind, streams in STREAMS_OF_KIND.items() for stream in streams}
@@ -59,7 +59,7 @@ class LidarInfo(msgspec.Struct):
 
 
 class Info(msgspec.Struct, kw_only=True):
-    """A recording at a glance. state, start_utc, stopped_by: null where nothing tells."""
+    """A recording at a glance. state, start_utc, stopped_by: null where nothing tells; resync: null without one."""
 
     folder: str
     name: str
@@ -75,6 +75,7 @@ class Info(msgspec.Struct, kw_only=True):
     videos: list[VideoStats]
     lidar: LidarInfo
     clocks: dict[str, ClockSummary]
+    resync: Resync | None
 
     def to_json(self) -> str:
         """For programs."""
@@ -107,6 +108,7 @@ def info(folder: Path) -> Info:
         videos=_videos(folder),
         lidar=lidar,
         clocks=manifest.clocks if manifest else {},
+        resync=manifest.resync if manifest else None,
     )
 
 
@@ -195,6 +197,10 @@ def print_info(recording: Info, console: Console) -> None:
         skew = "unknown" if clock.skew_ppm is None else f"{clock.skew_ppm:+.1f} ppm"
         uncertainty = "" if clock.uncertainty_us is None else f", uncertainty {clock.uncertainty_us:.0f} us"
         lines.append(f"clock {name}: skew {skew}{uncertainty}, {clock.resets} resets")
+    if recording.resync is not None:
+        clocks = (f"{name} {clock.uncertainty_us:.1f} us" for name, clock in recording.resync.clocks.items())
+        state = "times refined" if recording.resync.state == "done" else "refinement of the times was cut short"
+        lines.append(f"{state}, uncertainty then: {', '.join(clocks)}")
     if recording.bad_lines:
         lines.append(f"{recording.bad_lines} lines of {DATA_NAME} cannot be read")
     for text in lines:

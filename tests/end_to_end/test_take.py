@@ -12,6 +12,7 @@ import pytest
 
 from drivers.samples import POINT_DTYPE
 from recorder.decode import decode
+from recorder.recording.raw import NONE, read_clock_table
 from simulated_devices.scene import CameraRenderer, Room, stereo_pair
 
 DURATION_S = 7.0
@@ -65,7 +66,7 @@ SAME_TIME_S = 500e-6
 
 
 @pytest.mark.parametrize("device", TAPES)
-def test_tapes_decode_to_the_same_samples(take: Path, lines: list[dict], tmp_path: Path, device: str) -> None:
+def test_tapes_decode_to_the_same_samples(take: Path, tmp_path: Path, device: str) -> None:
     """Values, points and counts are equal; times come out of the clock map again, about as before.
 
     They differ where the map was asked a moment earlier or later, and for a clock that devices share in the take.
@@ -75,6 +76,7 @@ def test_tapes_decode_to_the_same_samples(take: Path, lines: list[dict], tmp_pat
         take / "raw" / f"{device}.pcapng", TAPES[device], (), out, stop=Event(),
         on_progress=lambda _: None, on_event=lambda _, event: None,
     )  # fmt: skip
+    lines = [json.loads(line) for line in (take / "raw" / "data.online.jsonl").read_text().splitlines()]
     again = [json.loads(line) for line in (out / "data.jsonl").read_text().splitlines()]
     kinds = {_kind(line) for line in again}
     for kind in kinds:
@@ -90,8 +92,9 @@ def test_tapes_decode_to_the_same_samples(take: Path, lines: list[dict], tmp_pat
         for name in ("x", "y", "z", "intensity", "ring"):
             assert np.array_equal(one[name], two[name])
     manifest = json.loads((take / "recording.json").read_text())
-    utc_minus_monotonic_ns = manifest["utc_at_time_0"]["utc_ns"] - manifest["start_monotonic_ns"]
-    pairs = [np.fromfile(folder / "raw" / f"{device}.clock", "<i8").reshape(-1, 2) for folder in (take, out)]
+    utc_minus_monotonic_ns = manifest["utc_at_time_0"]["host_clock_ns"] - manifest["start_monotonic_ns"]
+    tables = [read_clock_table(folder / "raw" / f"{device}.clock") for folder in (take, out)]
+    pairs = [table[table[:, 1] != NONE][:, :2] for table in tables]
     assert set(map(tuple, pairs[1].tolist())) <= set(map(tuple, (pairs[0] + [0, utc_minus_monotonic_ns]).tolist()))
     assert len(pairs[1]) > 0.98 * len(pairs[0])
 
@@ -105,6 +108,22 @@ def _values(line: dict) -> dict:
 
 def _kind(line: dict) -> str:
     return line["sensor"]["type"] if "sensor" in line else next(key for key in line if key not in ("time", "fix"))
+
+
+def test_times_are_refined_at_the_end_and_those_given_online_kept(take: Path, lines: list[dict]) -> None:
+    resync = json.loads((take / "recording.json").read_text())["resync"]
+    assert (resync["state"], resync["kept"], resync["lines"]) == ("done", 0, len(lines))
+    assert resync["clocks"].keys() == {"imu", "gnss", "lidar", "cameras"}
+    assert resync["clocks"]["imu"]["uncertainty_us"] < 300
+    assert len((take / "raw" / "data.online.jsonl").read_text().splitlines()) == len(lines)
+
+
+def test_utc_is_that_of_the_receiver(take: Path) -> None:
+    manifest = json.loads((take / "recording.json").read_text())
+    utc = manifest["utc_at_time_0"]
+    assert utc["source"] == "gnss"
+    assert abs(utc["utc_ns"] - utc["host_clock_ns"]) < 0.5e9
+    assert 0 < utc["uncertainty_s"] < 0.1
 
 
 def test_times_ascend_and_begin_at_zero(lines: list[dict]) -> None:

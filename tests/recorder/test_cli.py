@@ -96,6 +96,8 @@ def test_version(rigtape: Rigtape) -> None:
         (["simulate", "--duration", "3"], "--ideal and --duration go together"),
         (["info", "nowhere"], "'nowhere' does not exist"),
         (["check", "nowhere"], "'nowhere' does not exist"),
+        (["resync", "nowhere"], "'nowhere' does not exist"),
+        (["resync", ".", "-o", "rig.yaml"], "'rig.yaml' is a file"),
         (["rewind"], "No such command 'rewind'"),
     ],
 )
@@ -240,3 +242,9 @@ def test_simulate_becomes_the_simulation(rigtape: Rigtape, monkeypatch: pytest.M
         ["-m", "simulated_devices", str(rig_file), "--set", "simulate.seed=3"],
         ["-m", "simulated_devices", "--ideal", "twin", "--duration", "3.0"],
     ]
+
+
+def test_what_cannot_be_refined_is_one_clear_line(rigtape: Rigtape) -> None:
+    result = rigtape("resync", ".")
+    assert result.exit_code == 1
+    assert result.stderr == "rigtape: .: not a recording of rigtape, there is no recording.json in it\n"

@@ -507,3 +507,40 @@ def test_pictures_and_lines_stay_in_step_whatever_happens_on_the_way(tmp_path, s
         assert len({entry["picture"] for entry in line["frames"] if "picture" in entry}) == 1
     instants = [next(entry["picture"] for entry in line["frames"] if "picture" in entry) for line in lines]
     assert instants == sorted(set(instants))
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "text"),
+    [(0.001, "shows UTC"), (37.0, "it follows TAI"), (18.0, "GPS time"), (-1_699_999_000.0, "1970")],
+)
+def test_which_time_a_lidar_shows_is_told_once(tmp_path, ahead_s, text):
+    bench = Bench(tmp_path, ("lidar",))
+    arrivals = []
+    for index in range(20):
+        taken_ns = np.arange(index * 100 * MS, index * 100 * MS + 100 * MS, MS, dtype=np.int64)
+        ticks = 1_700_000_000 * S + round(ahead_s * S) + taken_ns
+        arrivals.append(("lidar", int(taken_ns[-1]) + DELAY_NS, ClockPairs(ticks, START_NS + taken_ns + DELAY_NS)))
+    bench.feed(arrivals)
+    bench.finish()
+    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    (event,) = [event for event in events if event["device"] == "lidar"]
+    assert text in event["text"]
+
+
+@pytest.mark.parametrize(("host_ahead_s", "warned"), [(0, False), (3600, True)])
+def test_fixes_tell_utc_at_time_0_and_check_the_hosts_clock(tmp_path, host_ahead_s, warned):
+    bench = Bench(tmp_path, ("gnss",))
+    utc_ns = (1_700_000_000 - host_ahead_s) * S
+    fixes = [
+        FixSample(utc_ns + at_ns, 0, 60.0, 24.0, 5.0, 17.0, 1.0, 2.0, "gst", 4, 9, 1.0, None)
+        for at_ns in range(0, 20 * S, 100 * MS)
+    ]
+    bench.feed([("gnss", fix.device_ticks - utc_ns + DELAY_NS, fix) for fix in fixes])
+    bench.pipeline.set_utc()
+    folder = bench.finish()
+    utc = read_manifest(folder).utc_at_time_0
+    assert (utc.source, utc.host_clock_ns) == ("gnss", 1_700_000_000 * S)
+    assert abs(utc.utc_ns - utc_ns) < 4 * MS
+    assert 0.09 < utc.uncertainty_s < 0.2
+    events = (folder / "events.jsonl").read_text()
+    assert ("3600.0 s ahead of the UTC of the receiver" in events) == warned
