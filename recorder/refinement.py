@@ -172,7 +172,10 @@ def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int
         order = np.lexsort((arrival_ns, axis, spans))
     host_ns = np.zeros_like(axis)
     if axis.size:
-        host_ns[order] = refine(axis[order], arrival_ns[order], NS_PER_S)
+        in_order = axis[order]
+        is_first = np.diff(in_order, prepend=in_order[0] - 1) != 0  # of several messages of one instant, the quickest
+        quickest_ns = refine(in_order[is_first], arrival_ns[order][is_first], NS_PER_S)
+        host_ns[order] = quickest_ns[np.cumsum(is_first) - 1]
     curves = _curves(axis[order], host_ns[order])
     times_ns = {}
     first = 0
