@@ -62,7 +62,8 @@ def test_every_device_is_in_it_and_nothing_was_lost(take: Path) -> None:
 
 
 TAPES = {"imu": "xsens", "gnss": "nmea", "lidar": "robosense", "mocap": "pose"}
-SAME_TIME_S = 500e-6
+# How far online stamps may lie apart: in the first second a clock is known to some delays' jitter, 16 ms for the GNSS.
+SAME_TIME_S = {"imu": 3e-3, "gnss": 30e-3, "lidar": 3e-3, "mocap": 3e-3}
 
 
 @pytest.mark.parametrize("device", TAPES)
@@ -86,7 +87,7 @@ def test_tapes_decode_to_the_same_samples(take: Path, tmp_path: Path, device: st
             del second[-1]
         assert list(map(_values, first)) == list(map(_values, second))
         times_s = np.array([[one["time"], two["time"]] for one, two in zip(first, second, strict=True)])
-        assert np.abs(times_s[:, 0] - times_s[:, 1]).max() < SAME_TIME_S
+        assert np.abs(times_s[:, 0] - times_s[:, 1]).max() < SAME_TIME_S[device]
     for path in (out / "lidar").glob("*.bin"):
         one, two = (np.fromfile(folder / "lidar" / path.name, POINT_DTYPE) for folder in (take, out))
         for name in ("x", "y", "z", "intensity", "ring"):
