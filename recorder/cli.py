@@ -1,6 +1,6 @@
 """The command line. Each command is thin: it reads its arguments, calls the part that does the work, prints.
 
-Exit codes: 0 good; 1 it could not be done; 2 wrong use or a wrong configuration; `check` and `recover` have their own.
+Exit codes: 0 good; 1 it could not be done; 2 wrong use or a wrong configuration; `check` has its own.
 """
 
 import contextlib

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,7 @@ class Reading:
 STILL = Reading(0, (0.0, 0.0, 9.80665), (0.0, 0.0, 0.0))
 
 
-class ImuDevice:
+class ImuDevice(ABC):
     """The device's side of a protocol: bytes in, answers out; readings in, messages out.
 
     measuring: False while a host has asked for quiet. baud: 0 until a host has asked for another speed.
@@ -65,11 +66,11 @@ class ImuDevice:
         """Take bytes from the host; give the replies they lead to."""
         return []
 
+    @abstractmethod
     def message(self, sample_number: int, reading: Reading) -> bytes:
         """What it sends for the sample of that number, b"" when no output is due at it."""
-        raise NotImplementedError
 
-    def withdraw(self, messages: list[bytes]) -> None:
+    def withdraw(self, messages: list[bytes]) -> None:  # noqa: B027 - most devices count nothing
         """Hear that these were not sent after all."""
 
 

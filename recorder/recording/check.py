@@ -97,7 +97,7 @@ def _check_manifest(folder: Path, findings: Findings) -> Manifest | None:
         findings.add("error", "manifest", MANIFEST_NAME, f"cannot be read: {error}")
         return None
     if manifest.state == "recording":
-        text = "the take was not ended (or still runs): run `rigtape recover` on the folder"
+        text = "the take broke off (or still runs): its files are readable as they are, up to about the last second"
         findings.add("error", "not-complete", MANIFEST_NAME, text)
     elif manifest.state == "recovered":
         findings.add("note", "recovered", MANIFEST_NAME, "the take broke off and was recovered")

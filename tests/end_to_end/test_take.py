@@ -62,8 +62,8 @@ def test_every_device_is_in_it_and_nothing_was_lost(take: Path) -> None:
 
 
 TAPES = {"imu": "xsens", "gnss": "nmea", "lidar": "robosense", "mocap": "pose"}
-# How far online stamps may lie apart: in the first second a clock is known to some delays' jitter, 16 ms for the GNSS.
-SAME_TIME_S = {"imu": 3e-3, "gnss": 30e-3, "lidar": 3e-3, "mocap": 3e-3}
+SAME_TIME_S = 500e-6
+GNSS_HOLD_S, GNSS_HELD_S = 1.2, 30e-3  # fixes of the first second are stamped by a dozen delays of 16 ms jitter
 
 
 @pytest.mark.parametrize("device", TAPES)
@@ -87,7 +87,9 @@ def test_tapes_decode_to_the_same_samples(take: Path, tmp_path: Path, device: st
             del second[-1]
         assert list(map(_values, first)) == list(map(_values, second))
         times_s = np.array([[one["time"], two["time"]] for one, two in zip(first, second, strict=True)])
-        assert np.abs(times_s[:, 0] - times_s[:, 1]).max() < SAME_TIME_S[device]
+        apart_s = np.abs(times_s[:, 0] - times_s[:, 1])
+        limit_s = np.where((device == "gnss") & (times_s[:, 0] < GNSS_HOLD_S), GNSS_HELD_S, SAME_TIME_S)
+        assert (apart_s < limit_s).all()
     for path in (out / "lidar").glob("*.bin"):
         one, two = (np.fromfile(folder / "lidar" / path.name, POINT_DTYPE) for folder in (take, out))
         for name in ("x", "y", "z", "intensity", "ring"):
@@ -166,11 +168,7 @@ def test_pictures_agree_with_the_ground_truth(take: Path, lines: list[dict]) -> 
             turned, moved = interpolate(time_s, rotation, position_m, at_s)
             errors.append(np.square(renderer.render(turned, moved).astype(float) - pictures[k]).mean())
         found_s.append(vertex(offsets_s, errors))
-    clocks = json.loads((take / "recording.json").read_text())["clocks"]
-    sigma_s = (
-        sum(clocks[name]["uncertainty_us"] for name in ("cameras", "imu")) * 1e-6
-    )  # more on a machine that is busy
-    assert np.abs(found_s).max() < 1e-3 + 3 * sigma_s, clocks
+    assert np.abs(found_s).max() < 2e-3
 
 
 def poses(lines: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

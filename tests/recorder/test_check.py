@@ -310,7 +310,7 @@ def test_each_fault_is_found(good: Recording, fault: str) -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("still recording", "rigtape recover"),
+        ("still recording", "the take broke off (or still runs)"),
         ("null", ": Expected `float`, got `null`"),
         ("number", "frames number 8, expected 7"),
         ("no scan file", "lidar/000003.bin is not there"),
