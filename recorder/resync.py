@@ -103,7 +103,7 @@ def _complete_manifest(folder: Path) -> Manifest:
     except (OSError, ValueError, RecursionError) as error:
         raise StorageError(f"{folder / MANIFEST_NAME}: cannot be read: {error}") from error
     if manifest.state == "recording":
-        raise StorageError(f"{folder}: is not complete: the take still runs, or broke off; only an ended take is refined")
+        raise StorageError(f"{folder}: is not complete: it still runs, or broke off; only an ended take is refined")
     return manifest
 
 
