@@ -148,7 +148,8 @@ class UdpLink:
     """UDP ports of one device: datagrams from its address, with the kernel's arrival time.
 
     address: the device's own address; datagrams from others are counted in `foreign` and not given out. A device on
-    loopback is listened for on loopback only. kernel_drops: what the kernel dropped for want of room, as it reports.
+    loopback is listened for on loopback only. kernel_drops: what was dropped for want of room, by the kernel as
+    it reports, or between links that share a port.
     receive_buffer_bytes: what the system granted of 32 MiB (forced where allowed).
     """
 
@@ -332,7 +333,12 @@ class UdpLink:
             if link is self:
                 chunks.append(chunk)
             else:
-                link._given.append(chunk)  # noqa: SLF001
+                link._take_over(chunk)  # noqa: SLF001
+
+    def _take_over(self, chunk: Chunk) -> None:
+        """Keep a datagram that another link has read, until this one is read; without room the oldest is dropped."""
+        self.kernel_drops += len(self._given) == GIVEN_DATAGRAMS
+        self._given.append(chunk)
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
         seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket

@@ -230,6 +230,16 @@ def test_whoever_reads_deals_out(ports: list[int]) -> None:
     UdpLink(LIDAR, (ports[0],)).close()
 
 
+def test_what_a_link_does_not_fetch_in_time_is_counted(ports: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(links, "GIVEN_DATAGRAMS", 3)
+    reader, sleeper = shared(ports[0]), shared(ports[0])
+    send([b"1", b"2", b"3", b"4", b"5"], ports[0])
+    assert len(read_all(reader)) == 5
+    assert (read_all(sleeper), sleeper.kernel_drops, reader.kernel_drops) == ([b"3", b"4", b"5"], 2, 0)
+    reader.close()
+    sleeper.close()
+
+
 def test_source_ports_tell_devices_apart(ports: list[int]) -> None:
     one, other = shared(ports[0], source_port=ports[1]), shared(ports[0], source_port=ports[2])
     send([b"1"], ports[0], source_port=ports[1])
