@@ -1,7 +1,7 @@
 """The ideal twin of a simulated recording: the same world and seed written straight to disk with the true times.
 
-No device, link or clock is in between, so what a take of the simulated rig loses against its twin is the cost of the
-way through them.
+The samples are of the instants at which the devices of that seed take them, by their own skewed clocks. No link lies in
+between and no clock has to be found out; what a take of the simulated rig loses against its twin is the cost of that.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from simulated_devices.nmea import ORIGIN, SIGMA_M
 from simulated_devices.pose import quaternion
 from simulated_devices.rig import IMUS, Cast, calibration, simulate_settings
 from simulated_devices.robosense import IMU_FROM_LIDAR
+from simulated_devices.sampling import SampleGrid
 from simulated_devices.scene import CameraRenderer, M1Scanner, PinholeCamera
-from simulated_devices.timing import SECOND_NS, random_for
+from simulated_devices.timing import SECOND_NS, Int64Array, random_for
 from simulated_devices.world import ImuNoise, NoisyImu, NoisyMagnetometer
 
-WORLD_BEFORE_START_S = 1.0  # a take begins about so long before the world does
+WORLD_START_NS = 3 * SECOND_NS  # about so long after the devices are switched on everybody has opened them
+TAKE_START_NS = WORLD_START_NS - SECOND_NS  # a take begins about so long before the world does
 TWIN_UTC_NS = 1_767_225_600 * SECOND_NS  # a date, so that the same seed gives the same files
-FRAMES_AFTER_IMU_NS = 1_100_000  # pictures do not fall on IMU samples, as with real devices
 RADIUS_UNIT_M = np.float32(0.005)
 ANGLE_ZERO = 32768
 BATCH = 100
@@ -49,8 +50,12 @@ class Twin:
         entries = source.get("devices")
         if not isinstance(entries, dict) or not entries:
             raise ConfigError("devices: a mapping of at least one device is needed")
-        self._cast = Cast(simulate_settings(source))
-        self._devices = {str(name): self._cast.device(str(name), entry) for name, entry in entries.items()}
+        self._cast = Cast(simulate_settings(source), epoch_ns=0)
+        try:
+            for name, entry in entries.items():
+                self._cast.device(str(name), entry)  # refuses what cannot be simulated, and places the cameras
+        finally:
+            self._cast.ports.close()  # nothing is sent
         for name, entry in entries.items():
             if entry["driver"] == "robosense-imu":
                 raise ConfigError(f"devices.{name}: an ideal twin cannot be written of a lidar's IMU")
@@ -73,11 +78,12 @@ class Twin:
         """All samples in time order."""
         return merge(*self._streams, key=lambda item: item[:2])
 
-    def _times(self, rate_hz: float, first_ns: int) -> Iterator[np.ndarray[Any, np.dtype[np.int64]]]:
-        count = int((self._duration_ns - first_ns) * rate_hz / SECOND_NS) + 1
-        for begin in range(0, count, BATCH):
-            index = np.arange(begin, min(begin + BATCH, count))
-            times_ns = first_ns + np.rint(index * (SECOND_NS / rate_hz)).astype(np.int64)
+    def _times(self, name: str, rate_hz: float) -> Iterator[Int64Array]:
+        """Recording times of the samples of a device: every period of its own clock, as in a take."""
+        grid = SampleGrid(self._cast.stage.clock(self.entries[name].get("clock") or name), SECOND_NS / rate_hz)
+        grid.start(TAKE_START_NS, ahead=1)
+        while grid.next_host_ns < TAKE_START_NS + self._duration_ns:
+            times_ns = grid.take(BATCH).host_ns - TAKE_START_NS
             yield times_ns[times_ns < self._duration_ns]
 
     def _rate_hz(self, name: str, key: str, default: float) -> float:
@@ -90,7 +96,7 @@ class Twin:
         stage, trajectory = self._cast.stage, self._cast.trajectory
         imu = NoisyImu(trajectory, ImuNoise(), rate_hz, stage.seed_for("imu", name))
         magnetometer = NoisyMagnetometer(trajectory, stage.seed_for("magnetometer", name))
-        for times_ns in self._times(rate_hz, 0):
+        for times_ns in self._times(name, rate_hz):
             world_s = _world_s(times_ns)
             gyro, accel = imu.read(world_s)
             field_ut = magnetometer.read(world_s)
@@ -102,7 +108,7 @@ class Twin:
                     yield time_ns, order, name, ImuSample(None, time_ns, accel_m_s2, None)
 
     def _pose(self, order: int, name: str) -> Iterator[Item]:
-        for times_ns in self._times(self._rate_hz(name, "rate_hz", 100), 0):
+        for times_ns in self._times(name, self._rate_hz(name, "rate_hz", 100)):
             rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             for index, time_ns in enumerate(times_ns.tolist()):
                 orientation = tuple(quaternion(rotation[index]).tolist())
@@ -110,7 +116,7 @@ class Twin:
 
     def _gnss(self, order: int, name: str) -> Iterator[Item]:
         random = random_for(self._cast.stage.seed, "gnss", name)
-        for times_ns in self._times(self._rate_hz(name, "rate_hz", 10), 0):
+        for times_ns in self._times(name, self._rate_hz(name, "rate_hz", 10)):
             _, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             north_east_up = random.normal(0.0, SIGMA_M, position_m.shape)
             latitude, longitude, altitude = ORIGIN.to_geodetic(position_m + north_east_up[:, [1, 0, 2]])
@@ -126,7 +132,7 @@ class Twin:
         renderer = CameraRenderer(self._cast.room, camera, seed=self._cast.stage.seed_for("camera", name))
         encoder = PictureEncoder(ClientStream(), camera.width, camera.height, fps)
         video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p")
-        for times_ns in self._times(fps, FRAMES_AFTER_IMU_NS):
+        for times_ns in self._times(name, fps):
             rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             for index, time_ns in enumerate(times_ns.tolist()):
                 picture = renderer.render(rotation[index], position_m[index])
@@ -137,7 +143,7 @@ class Twin:
 
     def _lidar(self, order: int, name: str) -> Iterator[Item]:
         scanner = M1Scanner(self._cast.stage.seed_for("lidar", name))
-        for times_ns in self._times(10, 0):
+        for times_ns in self._times(name, 10):
             for start_ns in times_ns.tolist():
                 frame = round(start_ns * 10 / SECOND_NS)
                 start_s = float(_world_s(np.array([start_ns]))[0])
@@ -149,8 +155,8 @@ class Twin:
                     yield last_ns, order, name, ScanSample(points, start_ns, last_ns, packets, packets, 0, False)
 
 
-def _world_s(times_ns: np.ndarray[Any, np.dtype[np.int64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    return np.asarray(times_ns * 1e-9 - WORLD_BEFORE_START_S, dtype=np.float64)
+def _world_s(times_ns: Int64Array) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.asarray((times_ns + (TAKE_START_NS - WORLD_START_NS)) * 1e-9, dtype=np.float64)
 
 
 def _points(

@@ -207,13 +207,14 @@ class UdpPorts:
 class Cast:
     """Makes the devices of a rig around one world."""
 
-    def __init__(self, settings: SimulateSettings) -> None:
+    def __init__(self, settings: SimulateSettings, epoch_ns: int | None = None) -> None:
+        """epoch_ns: host time at which the clocks show their start values (default: now)."""
         try:
             self.trajectory = Trajectory.named(settings.trajectory, settings.seed)
         except ValueError as error:
             raise ConfigError(f"simulate.trajectory: {error}") from error
         self.room = Room(settings.seed)
-        self.stage = Stage(settings.seed, settings.jitter, settings.skew_ppm)
+        self.stage = Stage(settings.seed, settings.jitter, settings.skew_ppm, epoch_ns=epoch_ns)
         self.cameras: list[PinholeCamera] = []
         self.ports = UdpPorts()
         self._faults = settings.faults

@@ -40,6 +40,7 @@ START_RANGE_NS = (60 * SECOND_NS, 300_000 * SECOND_NS)
 UART_BITS_PER_BYTE = 10
 UART_CHUNK_BYTES = 64
 WORLD_START_DELAY_NS = SECOND_NS
+WORLD_START_STEP_NS = 100 * MILLISECOND_NS
 BACKLOG_NS = SECOND_NS
 
 _PR_SET_PDEATHSIG = 1
@@ -324,11 +325,12 @@ class Stage:
     Made before the devices' processes are forked; the start time is in shared memory, 0 until it is known.
     """
 
-    def __init__(self, seed: int, jitter: float = 1.0, skew_ppm: float = 50.0) -> None:
+    def __init__(self, seed: int, jitter: float = 1.0, skew_ppm: float = 50.0, *, epoch_ns: int | None = None) -> None:
+        """epoch_ns: host time at which the clocks show their start values (default: now)."""
         self.seed = seed
         self.jitter = jitter
         self.skew_ppm = skew_ppm
-        self.epoch_ns = time.monotonic_ns()
+        self.epoch_ns = time.monotonic_ns() if epoch_ns is None else epoch_ns
         self.epoch_utc_ns = time.time_ns()
         self._start_ns: c_int64 = RawValue(c_int64, 0)
 
@@ -338,8 +340,12 @@ class Stage:
         return self._start_ns.value
 
     def start(self) -> None:
-        """Let the world start a second from now."""
-        self._start_ns.value = time.monotonic_ns() + WORLD_START_DELAY_NS
+        """Let the world start a second from now, at a multiple of 0.1 s since the epoch.
+
+        So the instants at which the devices sample the world follow from the seed, but for the skew of a few seconds.
+        """
+        earliest_ns = time.monotonic_ns() + WORLD_START_DELAY_NS - self.epoch_ns
+        self._start_ns.value = self.epoch_ns - (-earliest_ns // WORLD_START_STEP_NS) * WORLD_START_STEP_NS
 
     def world_s(self, host_ns: Int64Array) -> npt.NDArray[np.float64]:
         """World time at host times (n,); the world stands still as long as it has not started."""
