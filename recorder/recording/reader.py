@@ -35,6 +35,7 @@ class FrameEntry(msgspec.Struct, rename="camel"):
     camera_ind: int
     time: float | UnsetType = UNSET
     missing_bitmap: bool = False
+    exposure_time_seconds: float | UnsetType | None = UNSET
 
 
 class Gps(msgspec.Struct, rename="camel"):
@@ -79,15 +80,19 @@ class Pose(msgspec.Struct):
 
 
 class Line(msgspec.Struct, rename="camel"):
-    """One line of data.jsonl; keys that are not listed here are passed over, as the client does."""
+    """One line of data.jsonl; keys that are not listed here are passed over, as the client does.
+
+    fix: details beside `gps`, as they stand. pose: of groundTruth, or of a named method (by `read_lines`).
+    """
 
     time: float | UnsetType = UNSET
     sensor: Sensor | UnsetType = UNSET
     frames: list[FrameEntry] | UnsetType = UNSET
     number: int | UnsetType = UNSET
     gps: Gps | UnsetType = UNSET
+    fix: msgspec.Raw | UnsetType = UNSET
     lidar: LidarEntry | UnsetType = UNSET
-    ground_truth: Pose | UnsetType = UNSET
+    pose: Pose | UnsetType = msgspec.field(default=UNSET, name="groundTruth")
 
 
 class BadLine(msgspec.Struct):
@@ -128,11 +133,11 @@ def _other_stream(line: Line, raw: bytes) -> str:
         return "gps"
     if line.lidar is not UNSET:
         return "lidar"
-    if line.ground_truth is not UNSET:
+    if line.pose is not UNSET:
         return "groundTruth"
     for name, value in msgspec.json.decode(raw, type=dict[str, msgspec.Raw]).items():
         if b'"position"' in bytes(value):
-            msgspec.json.decode(value, type=Pose)
+            line.pose = msgspec.json.decode(value, type=Pose)
             return name
     return ""
 
