@@ -80,7 +80,8 @@ class PoseSample:
 class VideoFormat:
     """How a camera's pictures are coded: codec by its FFmpeg name, size and rate.
 
-    pixel_format: FFmpeg name. The codec's headers are in the packets of key frames.
+    pixel_format: FFmpeg name. The codec's headers are in the packets of key frames. Codec "rawvideo": pictures that the
+    recorder encodes, in gray, nv12, yuv420p, yuyv422, bgr24 or rgb24, or gray16le for depth in millimetres.
     """
 
     codec: str
@@ -92,9 +93,10 @@ class VideoFormat:
 
 @dataclass(frozen=True, slots=True)
 class FrameSample:
-    """One encoded picture of a camera, as it came.
+    """One picture of a camera, as it came.
 
-    device_ticks: middle of the exposure on the camera's clock, ns. packet: the codec's bytes (H.264: Annex B).
+    device_ticks: middle of the exposure on the camera's clock, ns. packet: the codec's bytes (H.264: Annex B); of
+    rawvideo the rows packed tightly, top to bottom, planes on end, and every picture is a key frame.
     exposure_s: length of the exposure, None where not known.
     """
 

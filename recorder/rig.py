@@ -1,15 +1,16 @@
 """rig.yaml: the set of devices and how each is reached, read into validated configs.
 
 A rig is a YAML mapping: `name`, `devices` (one entry per device, `driver` chooses the keys it may have),
-`calibration` (path of a calibration.json, relative to the rig file), `raw` (false: no raw tape) and `simulate`
-(settings of the simulated rig, not used by the recorder). Every fault names its key path and what is allowed.
+`calibration` (path of a calibration.json, relative to the rig file), `raw` (false: no raw tape), `video` (how raw
+pictures are encoded) and `simulate` (settings of the simulated rig, not used by the recorder). Every fault names its
+key path and what is allowed.
 """
 
 import copy
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ import yaml
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, driver_names, driver_type
 from recorder.errors import ConfigError
+from recorder.recording.encoder import ENCODERS, VideoSettings
 
-ROOT_KEYS = ("name", "devices", "calibration", "raw", "simulate")
+ROOT_KEYS = ("name", "devices", "calibration", "raw", "video", "simulate")
 URL_LOGIN = re.compile(r"://[^/@\s]+@")
 DEVICE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 
@@ -47,6 +49,7 @@ class Rig:
     calibration: Path | None
     raw: bool
     source: dict[str, Any]
+    video: VideoSettings = field(default_factory=VideoSettings)
 
 
 def load_rig(path: Path, settings: tuple[str, ...] = ()) -> Rig:
@@ -79,6 +82,7 @@ def parse_rig(text: str, origin: str, folder: Path, settings: tuple[str, ...] = 
         calibration=(folder / calibration) if calibration else None,
         raw=raw,
         source=_without_passwords(source),
+        video=_video(source.get("video", {}), origin),
     )
 
 
@@ -149,6 +153,19 @@ def _device(name: object, entry: object, origin: str) -> RigDevice:
         key_path = where + place.rstrip("`")
         raise ConfigError(f"{origin}: {key_path}: {message}") from error
     return RigDevice(name, driver, config)
+
+
+def _video(entry: object, origin: str) -> VideoSettings:
+    if not isinstance(entry, dict):
+        raise ConfigError(f"{origin}: video: must be a mapping, like {{encoder: x264, crf: 15}}")
+    _allow_keys(entry, tuple(field.name for field in msgspec.structs.fields(VideoSettings)), "video.", origin)
+    if entry.get("encoder", "x264") not in ENCODERS:
+        raise ConfigError(f"{origin}: video.encoder: no encoder {entry['encoder']!r}; known: {', '.join(ENCODERS)}")
+    try:
+        return msgspec.convert(entry, type=VideoSettings)
+    except msgspec.ValidationError as error:
+        message, _, place = str(error).partition(" - at `$")
+        raise ConfigError(f"{origin}: video{place.rstrip('`')}: {message}") from error
 
 
 def _check_values(node: object, where: str, origin: str) -> None:

@@ -205,6 +205,8 @@ class Take:
             lidar=any(device.summary.kind == "lidar" for device in self._devices.values()),
             raw=rig.raw,
             on_error=self._writer_failed,
+            on_event=on_event,
+            video=rig.video,
         )
         self._take_up_skews()
         self._pipeline = Pipeline(

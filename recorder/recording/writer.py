@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from drivers.samples import FixSample, FrameSample, ImuSample, PoseSample, ScanSample
+from drivers.samples import DeviceEvent, FixSample, FrameSample, ImuSample, PoseSample, ScanSample
+from recorder.recording.encoder import VideoSettings
 from recorder.recording.jsonl import (
     LineWriter,
     PendingFrames,
@@ -52,13 +53,15 @@ from recorder.recording.work import HashedFile, Ticket
 CALIBRATION_NAME = "calibration.json"
 CLOCK_LOG_NAME = f"{RAW_FOLDER}/clocks.jsonl"
 OnError = Callable[[str, Exception], None]
+OnEvent = Callable[[str, DeviceEvent], None]
 
 
 class RecordingWriter:
     """One recording being written.
 
     manifest: kept up to date by the caller (`devices`, `clocks`); written at the start and at the end.
-    on_error: told of an error in a writer thread; the recording must then be closed.
+    on_error: told of an error in a writer thread; the recording must then be closed. on_event: told of what is left out
+    of a video, and why, after it was written into events.jsonl.
     """
 
     def __init__(
@@ -70,9 +73,14 @@ class RecordingWriter:
         lidar: bool,
         raw: bool,
         on_error: OnError,
+        on_event: OnEvent = lambda device, event: None,
+        video: VideoSettings | None = None,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Create all files in an existing, empty folder. monotonic_ns: the clock that stamps events."""
+        """Create all files in an existing, empty folder.
+
+        video: how raw pictures are encoded. monotonic_ns: the clock that stamps events.
+        """
         self._faults: list[str] = []
         self._clock_log: HashedFile | None = None
 
@@ -92,12 +100,16 @@ class RecordingWriter:
         self._lines = LineWriter(folder, failed)
         self._scans = ScanWriter(folder, failed) if lidar else None
         self.videos = [
-            VideoWriter(folder / video_name(index), failed, self._refused(camera))
+            VideoWriter(folder / video_name(index), failed, self._note(camera, on_event), video)
             for index, camera in enumerate(manifest.cameras)
         ]
 
-    def _refused(self, camera: str) -> Callable[[str], None]:
-        return lambda text: self.events.write(camera, "drop", text)
+    def _note(self, camera: str, on_event: OnEvent) -> Callable[[DeviceEvent], None]:
+        def note(event: DeviceEvent) -> None:
+            self.events.write(camera, event.kind, event.text, event.count)
+            on_event(camera, event)
+
+        return note
 
     def write_imu(self, device: str, time_ns: int, sample: ImuSample, *, late: bool = False) -> bool:
         """One line per sensor of the sample, counted for its device; False when a value is not a number."""
@@ -167,8 +179,11 @@ class RecordingWriter:
         faults = self._faults
         for camera, video in zip(self.manifest.cameras, self.videos, strict=True):
             video.close()
-            self.manifest.devices[camera].stream.written = video.pictures
-            self.manifest.devices[camera].stream.dropped += video.refused
+            stream = self.manifest.devices[camera].stream
+            left_out = video.refused + video.dropped
+            stream.written = video.pictures
+            stream.received -= left_out
+            stream.dropped += left_out
         files: dict[str, FileEntry] = {}
         for closer in (self._scans, self._lines, self.raw):
             if closer is not None:

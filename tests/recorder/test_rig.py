@@ -97,7 +97,7 @@ DEVICE = "devices:\n  imu:\n    driver: port\n    port: a\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("nmae: walk\n" + DEVICE, "nmae: unknown key; allowed: calibration, devices, name, raw, simulate"),
+        ("nmae: walk\n" + DEVICE, "nmae: unknown key; allowed: calibration, devices, name, raw, simulate, video"),
         (
             DEVICE + "    prot: b\n",
             "devices.imu.prot: unknown key; allowed: clock, driver, latency_s, mode, options, port, rate_hz, required",
@@ -120,8 +120,8 @@ DEVICE = "devices:\n  imu:\n    driver: port\n    port: a\n"
         ("name: walk", "devices: a mapping of at least one device is needed"),
         ("calibration: 5\n" + DEVICE, "calibration: must be the path of a calibration.json"),
         ("raw: 'no'\n" + DEVICE, "raw: must be true or false"),
-        ("- a", "must be a mapping with the keys name, devices, calibration, raw, simulate"),
-        ("", "must be a mapping with the keys name, devices, calibration, raw, simulate"),
+        ("- a", "must be a mapping with the keys name, devices, calibration, raw, video, simulate"),
+        ("", "must be a mapping with the keys name, devices, calibration, raw, video, simulate"),
         ("devices: {imu: [}", "not valid YAML: "),
         ("a: \x00", "not valid YAML: "),
         ("{a: 1, ? [b] : 2}", "not valid YAML: "),

@@ -482,10 +482,10 @@ def test_a_full_disk_ends_the_take_loudly_and_leaves_it_not_complete(bench, pict
 
 
 def test_a_video_that_cannot_be_written_ends_the_take_with_the_rest_kept(bench, pictures, monkeypatch, read_lines):
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("recorder.recording.video.VideoWriter._packet", full)
+    monkeypatch.setattr("recorder.recording.matroska.MatroskaFile.mux", full)
     bench.add("imu", imu_act(100))
     bench.add("left", camera_act(pictures(20)))
     with pytest.raises(StorageError, match=r"data\.mkv: .*No space left on device"):

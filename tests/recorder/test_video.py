@@ -4,6 +4,7 @@ import errno
 import shutil
 
 from drivers.samples import FrameSample, VideoFormat
+from recorder.recording.matroska import MatroskaFile
 from recorder.recording.video import VideoWriter, video_name
 
 
@@ -14,8 +15,11 @@ class Told:
         self.errors: list[Exception] = []
         self.refused: list[str] = []
 
-    def writer(self, path):
-        return VideoWriter(path, lambda name, error: self.errors.append(error), self.refused.append)
+    def note(self, event):
+        self.refused.append(event.text)
+
+    def writer(self, path, settings=None):
+        return VideoWriter(path, lambda name, error: self.errors.append(error), self.note, settings)
 
 
 def put_all(writer, frames):
@@ -124,16 +128,16 @@ def test_full_disk_fails_every_ticket_that_is_not_in_the_file(tmp_path, pictures
 def test_an_error_in_the_middle_of_a_batch_fails_the_rest_and_what_comes_later(tmp_path, pictures, monkeypatch, until):
     told = Told()
     packets = 0
-    real = VideoWriter._packet
+    real = MatroskaFile.mux
 
-    def failing(self: VideoWriter, time_ns: int, frame: FrameSample, stream: object) -> object:
+    def failing(self: MatroskaFile, data: bytes, time_ms: int, *, is_keyframe: bool) -> None:
         nonlocal packets
         packets += 1
         if packets == 4:
             raise OSError(errno.ENOSPC, "No space left on device")
-        return real(self, time_ns, frame, stream)
+        real(self, data, time_ms, is_keyframe=is_keyframe)
 
-    monkeypatch.setattr(VideoWriter, "_packet", failing)
+    monkeypatch.setattr(MatroskaFile, "mux", failing)
     writer = told.writer(tmp_path / "data.mkv")
     frames = pictures(12)
     tickets = put_all(writer, frames[:8])
