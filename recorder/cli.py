@@ -20,8 +20,10 @@ from rich.progress import Progress
 
 from recorder import devices as attached
 from recorder import simulation
+from recorder.cli_errors import clear_errors
+from recorder.cli_formats import export, import_
 from recorder.decode import decode as decode_capture
-from recorder.errors import ConfigError, RecorderError
+from recorder.errors import RecorderError
 from recorder.recording.check import check as check_recording
 from recorder.recording.check import print_report
 from recorder.recording.info import info as recording_info
@@ -55,16 +57,8 @@ def main(context: click.Context, verbose: bool) -> None:
     logging.basicConfig(level=logging.DEBUG if verbose else logging.CRITICAL)
 
 
-@contextlib.contextmanager
-def clear_errors(verbose: bool) -> Iterator[None]:
-    """Turn the recorder's own errors into one clear line and the right exit code."""
-    try:
-        yield
-    except RecorderError as error:
-        if verbose:
-            raise
-        click.echo(f"rigtape: {error}", err=True)
-        sys.exit(2 if isinstance(error, ConfigError) else 1)
+main.add_command(export)
+main.add_command(import_)
 
 
 @main.command()
