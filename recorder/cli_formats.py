@@ -68,6 +68,7 @@ def export(
 @click.option("--format", "format_name", required=True, help=f"One of {', '.join(format_names(IMPORTERS))}.")
 @start_option
 @end_option
+@click.option("--information", type=click.Choice(["row", "toro", "sqrt"]), help="Of graphs: how matrices are written.")
 @set_option
 @json_option
 @click.pass_obj
@@ -78,6 +79,7 @@ def import_(
     format_name: str,
     start_s: float | None,
     end_s: float | None,
+    information: str | None,
     settings: tuple[str, ...],
     as_json: bool,
 ) -> None:
@@ -87,9 +89,12 @@ def import_(
     left behind.
 
     \b
-    Example:
+    Examples:
       rigtape import MH_01_easy imported --format euroc
+      rigtape import w100.graph imported --format slampp --information toro
     """
+    if information is not None:
+        settings = (*settings, f"information={information}")
 
     def work(show: OnProgress) -> Summary:
         span = {"start_s": start_s, "end_s": end_s}
