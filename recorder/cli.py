@@ -204,6 +204,30 @@ def simulate(rig: Path | None, ideal: Path | None, duration: float | None, setti
 
 
 @main.command()
+@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--speed", type=float, default=1.0, show_default=True, metavar="X", help="So many times as fast.")
+def replay(recording: Path, speed: float) -> None:
+    """Bring the devices of RECORDING back, for any program to read, and print the rig.yaml to record them.
+
+    What is on the raw tape comes byte for byte with the timing it had: serial lines as ptys, datagrams on their ports,
+    pictures over TCP with the camera's own stamps. Without a tape (recordings imported from other systems) the samples
+    are sent at their times in protocols that carry them. It starts some eight seconds after the devices are opened,
+    and ends with the recording.
+
+    \b
+    Examples:
+      rigtape replay demo/2026-11-22T10-00-00Z > replay.yaml &       then: rigtape record replay.yaml
+      rigtape replay demo/2026-11-22T10-00-00Z --speed 4 > replay.yaml
+
+    At another speed than 1 the devices' clocks run at that speed against the host's: good for programs that go by the
+    devices' time, not for recording.
+    """
+    arguments = [*simulation.command(None, ()), "--replay", str(recording), "--speed", str(speed)]
+    sys.stdout.flush()
+    os.execv(arguments[0], arguments)
+
+
+@main.command()
 @click.argument("capture", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--driver", required=True, help="Driver of the device that was captured (xsens, nmea, robosense, ...).")
 @click.option("-o", "--output", type=Folder, required=True, help="Folder of the recording; empty or not there yet.")

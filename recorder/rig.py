@@ -86,6 +86,14 @@ def parse_rig(text: str, origin: str, folder: Path, settings: tuple[str, ...] = 
     )
 
 
+def driver_keys(driver: str) -> frozenset[str]:
+    """The keys that a device of this driver may have in a rig. Raises ConfigError."""
+    try:
+        return frozenset(field.name for field in msgspec.structs.fields(driver_type(driver).config))
+    except DeviceError as error:
+        raise ConfigError(str(error)) from error
+
+
 def apply_settings(source: Mapping[str, Any], settings: tuple[str, ...]) -> dict[str, Any]:
     """A copy of `source` with each `key.path=value` set; values are read as YAML. Raises ConfigError."""
     changed = copy.deepcopy(dict(source))

@@ -19,7 +19,8 @@ import yaml
 
 from recorder.errors import ConfigError, RecorderError
 from simulated_devices.ideal import write_ideal
-from simulated_devices.rig import DeviceDiedError, Simulation, read_rig
+from simulated_devices.replay import replay
+from simulated_devices.rig import DeviceDiedError, read_rig, simulated_rig
 
 EXIT_FAILED = 1
 EXIT_WRONG_USE = 2
@@ -35,6 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="key=value", help="set a key path of the rig")
     parser.add_argument("--ideal", type=Path, metavar="DIR", help="write the same world straight to a recording")
     parser.add_argument("--duration", type=float, default=30.0, metavar="S", help="seconds of it (with --ideal)")
+    parser.add_argument("--replay", type=Path, metavar="REC", help="bring the devices of a recording back instead")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="so many times as fast (with --replay)")
     parser.add_argument("--report", action="store_true", help="at the end, say what was sent and how timely")
     options = parser.parse_args(arguments)
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
@@ -44,10 +47,16 @@ def main(arguments: list[str] | None = None) -> int:
         if options.ideal is not None:
             write_ideal(read_rig(options.rig, tuple(options.set)), options.ideal, options.duration)
             return 0
-        with Simulation(read_rig(options.rig, tuple(options.set)), report=options.report) as simulation:
+        if options.replay is not None:
+            simulation = replay(options.replay, options.speed, report=options.report)
+        else:
+            simulation = simulated_rig(read_rig(options.rig, tuple(options.set)), report=options.report)
+        with simulation:
             sys.stdout.write(yaml.safe_dump(simulation.document, sort_keys=False, explicit_end=True))
             sys.stdout.flush()
             simulation.run(parent)
+        if options.replay is not None:
+            sys.stderr.write("the replay is over\n")
     except KeyboardInterrupt:
         return 0
     except BrokenPipeError:  # whoever wanted to read the rig is gone

@@ -30,6 +30,7 @@ RATES_HZ = (1, 2, 4, 5, 10, 20)
 UTC_OFFSET_NS = 100 * MILLISECOND_NS
 SIGMA_M = (0.010, 0.012, 0.020)  # north, east, up: what GST states and what the noise is
 DAY_NS = 86_400 * SECOND_NS
+MODES = {2: "D", 4: "R", 5: "F"}  # RMC's word for a quality of GGA
 KNOT_M_S = 1852.0 / 3600.0
 
 DELAY = DelayModel(
@@ -52,7 +53,7 @@ class NmeaSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """One epoch's solution: UTC in nanoseconds since 1970, degrees, metres, m/s east and north."""
+    """One epoch's solution: UTC in nanoseconds since 1970, degrees, metres, m/s east and north; quality as in GGA."""
 
     utc_ns: int
     latitude_deg: float
@@ -61,6 +62,7 @@ class Fix:
     undulation_m: float
     velocity_m_s: tuple[float, float]
     sigma_m: tuple[float, float, float]
+    quality: int = 4
 
 
 def sentence(body: str) -> bytes:
@@ -79,7 +81,7 @@ def degrees_minutes(angle_deg: float, degree_digits: int) -> str:
 
 
 def epoch_sentences(fix: Fix) -> list[bytes]:
-    """GGA, RMC, GST and ZDA of one RTK fix."""
+    """GGA, RMC, GST and ZDA of one fix."""
     utc = _EPOCH + timedelta(microseconds=fix.utc_ns // 1000)
     clock = f"{utc:%H%M%S}.{utc.microsecond // 10000:02d}"
     position = (
@@ -90,10 +92,13 @@ def epoch_sentences(fix: Fix) -> list[bytes]:
     knots = float(np.hypot(east, north)) / KNOT_M_S
     course_deg = float(np.degrees(np.arctan2(east, north))) % 360.0
     north_m, east_m, up_m = fix.sigma_m
+    mode = MODES.get(fix.quality, "A")
     ellipse = f"{max(north_m, east_m):.4f},{min(north_m, east_m):.4f},{90.0 if east_m > north_m else 0.0:.1f}"
     return [
-        sentence(f"GNGGA,{clock},{position},4,24,0.6,{fix.altitude_m:.4f},M,{fix.undulation_m:.4f},M,1.0,0001"),
-        sentence(f"GNRMC,{clock},A,{position},{knots:.3f},{course_deg:.2f},{utc:%d%m%y},,,R,V"),
+        sentence(
+            f"GNGGA,{clock},{position},{fix.quality},24,0.6,{fix.altitude_m:.4f},M,{fix.undulation_m:.4f},M,1.0,0001"
+        ),
+        sentence(f"GNRMC,{clock},A,{position},{knots:.3f},{course_deg:.2f},{utc:%d%m%y},,,{mode},V"),
         sentence(f"GNGST,{clock},0.0120,{ellipse},{north_m:.4f},{east_m:.4f},{up_m:.4f}"),
         sentence(f"GNZDA,{clock},{utc:%d,%m,%Y},00,00"),
     ]

@@ -46,16 +46,16 @@ def quaternion(rotation: FloatArray) -> FloatArray:
     return -unit if unit[0] < 0 else unit
 
 
-def pose_message(sequence: int, time_us: int, rotation: FloatArray, position_m: FloatArray) -> bytes:
-    """One datagram: rotation (3, 3) world_from_imu and position (3,) of the IMU in the world."""
-    return json.dumps(
-        {
-            "sequence": sequence,
-            "time_us": time_us,
-            "position": [round(value, 9) for value in position_m.tolist()],
-            "orientation": [round(value, 12) for value in quaternion(rotation).tolist()],
-        }
-    ).encode()
+def pose_message(sequence: int, time_us: int, orientation_wxyz: FloatArray | None, position_m: FloatArray) -> bytes:
+    """One datagram: orientation (4,) world_from_imu, where it is known, and position (3,) of the IMU in the world."""
+    message: dict[str, object] = {
+        "sequence": sequence,
+        "time_us": time_us,
+        "position": [round(value, 9) for value in position_m.tolist()],
+    }
+    if orientation_wxyz is not None:
+        message["orientation"] = [round(value, 12) for value in orientation_wxyz.tolist()]
+    return json.dumps(message).encode()
 
 
 class PoseSimulator:
@@ -106,7 +106,9 @@ class PoseSimulator:
                 times_us = np.rint(instants.device_ns / 1000).astype(np.int64)
                 rotation, position_m = self._trajectory.pose(self._stage.world_s(instants.host_ns))
                 for index, release_ns in enumerate(self._delay.release_ns(instants.host_ns).tolist()):
-                    message = pose_message(sequence, int(times_us[index]), rotation[index], position_m[index])
+                    message = pose_message(
+                        sequence, int(times_us[index]), quaternion(rotation[index]), position_m[index]
+                    )
                     self.pacer.wait_until(release_ns)
                     sender.sendto(message, (HOST, self._port))
                     self.pacer.done(release_ns)

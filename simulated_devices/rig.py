@@ -297,32 +297,32 @@ class Cast:
 
 
 class Simulation:
-    """A running simulated rig; leaving it ends the devices and removes the temporary folder.
+    """Running simulated devices; leaving it ends them and removes the temporary folder.
 
     document: the rig with addresses, latencies and calibration filled in.
     """
 
-    def __init__(self, source: dict[str, Any], *, report: bool = False) -> None:
-        """`report`: each device says at its end what it sent and how timely. Raises ConfigError."""
-        entries = source.get("devices")
-        if not isinstance(entries, dict) or not entries:
-            raise ConfigError("devices: a mapping of at least one device is needed")
-        settings = simulate_settings(source)
-        for key, names in (("faults", settings.faults), ("lidars", settings.lidars)):
-            for name in names:
-                if name not in entries:
-                    there = ", ".join(map(str, entries))
-                    raise ConfigError(f"simulate.{key}.{name}: no such device; there are: {there}")
-        cast = Cast(settings)
-        try:
-            self._devices = [cast.device(str(name), entry) for name, entry in entries.items()]
-        except ConfigError:
-            cast.ports.close()
-            raise
-        self._cameras = cast.cameras
-        self._ports = cast.ports
-        self._stage = cast.stage
+    def __init__(
+        self,
+        devices: Sequence[SimulatedDevice],
+        source: dict[str, Any],
+        stage: Stage,
+        ports: UdpPorts,
+        *,
+        calibration: dict[str, Any] | None = None,
+        settle_ns: int = 0,
+        report: bool = False,
+    ) -> None:
+        """source: the rig, with an entry for each device. report: each says at its end what it sent and how timely.
+
+        settle_ns: at least so long after the first device was opened the world starts.
+        """
+        self._devices = devices
         self._source = source
+        self._stage = stage
+        self._ports = ports
+        self._calibration = calibration
+        self._settle_ns = settle_ns
         self._report = report
         self._processes: dict[str, BaseProcess] = {}
 
@@ -342,20 +342,27 @@ class Simulation:
         self._end()
 
     def run(self, parent: int) -> None:
-        """Keep the world going as long as process `parent` is this one's parent. Raises DeviceDiedError."""
+        """Keep the world going as long as process `parent` is this one's parent, or until all devices have ended.
+
+        Raises DeviceDiedError when one fails.
+        """
         first_opened_ns: int | None = None
         while os.getppid() == parent:
             moving = self._stage.start_ns != 0
-            ended = connection.wait([process.sentinel for process in self._processes.values()], 0.1 if moving else 0.02)
-            if ended:
-                dead = [name for name, process in self._processes.items() if process.sentinel in ended]
+            running = [process.sentinel for process in self._processes.values() if process.exitcode is None]
+            connection.wait(running, 0.1 if moving else 0.02)
+            if all(process.exitcode == 0 for process in self._processes.values()):
+                return  # all have played their part to its end
+            dead = [name for name, process in self._processes.items() if process.exitcode]
+            if dead:
                 raise DeviceDiedError(f"simulated device {', '.join(dead)} ended by itself")
             if moving:
                 continue
             opened = [bool(device.opened) for device in self._devices if device.opened is not None]
             if any(opened) and first_opened_ns is None:
                 first_opened_ns = time.monotonic_ns()
-            if all(opened) or (first_opened_ns is not None and time.monotonic_ns() > first_opened_ns + OPENING_NS):
+            waited_ns = time.monotonic_ns() - (first_opened_ns or time.monotonic_ns()) - self._settle_ns
+            if waited_ns >= 0 and (all(opened) or waited_ns > OPENING_NS):
                 self._stage.start()
 
     def _open(self) -> dict[str, Any]:
@@ -366,9 +373,9 @@ class Simulation:
             device.name: {**self._source["devices"][device.name], **device.open(self._folder)}
             for device in self._devices
         }
-        if self._cameras:
+        if self._calibration is not None:
             path = self._folder / "calibration.json"
-            path.write_text(json.dumps(calibration(self._cameras), indent=2) + "\n")
+            path.write_text(json.dumps(self._calibration, indent=2) + "\n")
             document["calibration"] = str(path)
         return document
 
@@ -400,6 +407,27 @@ class Simulation:
         self._ports.close()
         shutil.rmtree(self._folder, ignore_errors=True)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
+
+
+def simulated_rig(source: dict[str, Any], *, report: bool = False) -> Simulation:
+    """The devices of a rig around one world. Raises ConfigError."""
+    entries = source.get("devices")
+    if not isinstance(entries, dict) or not entries:
+        raise ConfigError("devices: a mapping of at least one device is needed")
+    settings = simulate_settings(source)
+    for key, names in (("faults", settings.faults), ("lidars", settings.lidars)):
+        for name in names:
+            if name not in entries:
+                there = ", ".join(map(str, entries))
+                raise ConfigError(f"simulate.{key}.{name}: no such device; there are: {there}")
+    cast = Cast(settings)
+    try:
+        devices = [cast.device(str(name), entry) for name, entry in entries.items()]
+    except ConfigError:
+        cast.ports.close()
+        raise
+    made = calibration(cast.cameras) if cast.cameras else None
+    return Simulation(devices, source, cast.stage, cast.ports, calibration=made, report=report)
 
 
 def _device_process(device: SimulatedDevice, others: Sequence[SimulatedDevice], parent: int, report: bool) -> None:

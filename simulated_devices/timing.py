@@ -368,7 +368,7 @@ class Stage:
 
 
 class Opened:
-    """A flag in shared memory: the device has been opened by whoever records it."""
+    """A flag in shared memory: whoever records the device has opened it."""
 
     def __init__(self) -> None:
         self._flag: c_int64 = RawValue(c_int64, 0)
@@ -376,9 +376,9 @@ class Opened:
     def __bool__(self) -> bool:
         return bool(self._flag.value)
 
-    def set(self) -> None:
-        """Raise the flag."""
-        self._flag.value = 1
+    def set(self, is_open: bool = True) -> None:
+        """Raise the flag, or lower it."""
+        self._flag.value = is_open
 
 
 def die_with_parent(signal_number: int = signal.SIGTERM) -> None:

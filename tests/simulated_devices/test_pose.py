@@ -34,7 +34,7 @@ def test_a_quarter_turn_about_the_vertical():
 
 
 def test_a_datagram():
-    message = pose_message(7, 123_456_789, np.eye(3), np.array([1.0, -2.0, 0.5]))
+    message = pose_message(7, 123_456_789, quaternion(np.eye(3)), np.array([1.0, -2.0, 0.5]))
     assert message == (
         b'{"sequence": 7, "time_us": 123456789, "position": [1.0, -2.0, 0.5], "orientation": [1.0, 0.0, 0.0, 0.0]}'
     )
@@ -42,6 +42,6 @@ def test_a_datagram():
 
 def test_a_datagram_keeps_the_pose_of_the_trajectory():
     rotation, position_m = Trajectory.named("brisk", 1).pose(np.array([7.3]))
-    said = json.loads(pose_message(0, 0, rotation[0], position_m[0]))
+    said = json.loads(pose_message(0, 0, quaternion(rotation[0]), position_m[0]))
     np.testing.assert_allclose(said["position"], position_m[0], atol=1e-8)
     np.testing.assert_allclose(rotation_of(*said["orientation"]), rotation[0], atol=1e-10)

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from recorder.errors import ConfigError
-from simulated_devices.rig import Simulation, UdpPorts, calibration, read_rig, simulate_settings
+from simulated_devices.rig import UdpPorts, calibration, read_rig, simulate_settings, simulated_rig
 from simulated_devices.scene import stereo_pair
 
 DEADLINE_S = 10.0
@@ -267,7 +267,7 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
 )
 def test_wrong_use_names_the_key_and_what_is_allowed(setting, words):
     with pytest.raises(ConfigError) as raised:
-        Simulation(read_rig(None, (setting,)))
+        simulated_rig(read_rig(None, (setting,)))
     for word in words:
         assert word in str(raised.value)
 

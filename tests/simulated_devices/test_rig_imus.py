@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from recorder.errors import ConfigError
-from simulated_devices.rig import Simulation
+from simulated_devices.rig import simulated_rig
 
 DEADLINE_S = 10.0
 IMUS = {
@@ -245,6 +245,6 @@ def test_poses_and_lidar_packets_are_lost_and_begin_anew(tmp_path):
 def test_faults_that_cannot_be_are_refused(faults, words):
     devices = {"imu": {"driver": "vectornav"}, "camera": {"driver": "stream"}, "mocap": {"driver": "pose", "port": 0}}
     with pytest.raises(ConfigError) as raised:
-        Simulation({"simulate": {"faults": faults}, "devices": devices})
+        simulated_rig({"simulate": {"faults": faults}, "devices": devices})
     for word in words:
         assert word in str(raised.value)

@@ -1,0 +1,98 @@
+"""A recording comes back as live devices and is recorded again, by the commands a user types."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import recorder
+from recorder.recording.model import Recording
+from tests.recorder.formats.conftest import write_recording
+
+RIGTAPE = [sys.executable, "-m", "recorder.cli"]
+MOST_LATE_NS = 20_000_000  # of stamps after a second way through a machine that may be busy
+
+
+def recorded_again(take: Path, folder: Path) -> Recording:
+    """Replay a recording, record it until it is over, and open what was recorded."""
+    with subprocess.Popen([*RIGTAPE, "replay", str(take)], stdout=subprocess.PIPE, text=True) as replay:
+        assert replay.stdout is not None
+        document = "".join(iter(replay.stdout.readline, "...\n"))
+        (folder / "replay.yaml").write_text(document)
+        command = [*RIGTAPE, "record", str(folder / "replay.yaml"), "-o", str(folder), "--name", "again"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as record:
+            assert replay.wait(40) == 0
+            record.send_signal(signal.SIGINT)
+            told, _ = record.communicate(timeout=20)
+            assert record.returncode == 0, told
+    return recorder.open(folder / "again")
+
+
+def shift_ns(before: Any, after: Any, values: str) -> int:
+    """All rows of `before` are in `after`, in order; gives by how much their times differ, and that it is always so."""
+    rows = [row.tobytes() for row in getattr(after, values)]
+    begin = rows.index(getattr(before, values)[0].tobytes())
+    assert rows[begin : begin + len(before)] == [row.tobytes() for row in getattr(before, values)]
+    shifts = after.time_ns[begin : begin + len(before)] - before.time_ns
+    assert np.ptp(shifts) < 2 * MOST_LATE_NS
+    return int(np.median(shifts))
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("take")
+    options = ["--simulate", "--duration", "3", "-o", str(out), "--name", "first", "--set", "simulate.trajectory=brisk"]
+    subprocess.run([*RIGTAPE, "record", *options], check=True, timeout=40, capture_output=True)
+    return out / "first"
+
+
+def test_the_raw_tape_gives_the_same_samples_again(take: Path, tmp_path: Path) -> None:
+    before, after = recorder.open(take), recorded_again(take, tmp_path)
+    for kind in ("gyroscope", "accelerometer", "magnetometer"):
+        shift = shift_ns(before.sensor(kind), after.sensor(kind), "values")
+    assert abs(shift_ns(before.fixes, after.fixes, "geodetic") - shift) < 4 * MOST_LATE_NS
+    assert abs(shift_ns(before.poses["groundTruth"], after.poses["groundTruth"], "position_m") - shift) < MOST_LATE_NS
+    scans = [[part.scans.points(index) for index in range(len(part.scans))] for part in (before, after)]
+    axes = ["x", "y", "z", "intensity", "ring"]
+    known = [points[axes].tobytes() for points in scans[1]]
+    assert all(points[axes].tobytes() in known for points in scans[0])
+    pictures = [[images for _, images in part.frames.images()] for part in (before, after)]
+    known = [b"".join(image.tobytes() for image in images if image is not None) for images in pictures[1]]
+    begin = known.index(b"".join(image.tobytes() for image in pictures[0][0]))
+    for index, images in enumerate(pictures[0]):
+        assert known[begin + index] == b"".join(image.tobytes() for image in images), index
+    assert np.abs(after.frames.time_ns[begin : begin + len(before.frames)] - before.frames.time_ns - shift).max() < (
+        MOST_LATE_NS
+    )
+
+
+def test_what_has_no_tape_is_sent_in_protocols_that_carry_it(tmp_path: Path) -> None:
+    """As recordings that were imported from other systems."""
+    folder = write_recording(tmp_path / "imported", lidar=False)
+    before, after = recorder.open(folder), recorded_again(folder, tmp_path)
+    shift = shift_ns(before.sensor("gyroscope"), after.sensor("gyroscope"), "values")
+    shift_ns(before.sensor("accelerometer"), after.sensor("accelerometer"), "values")
+    (poses,) = after.poses.values()
+    assert len(poses) == len(before.poses["groundTruth"])
+    assert poses.position_m == pytest.approx(before.poses["groundTruth"].position_m, abs=1e-8)
+    assert np.abs(poses.time_ns - before.poses["groundTruth"].time_ns - shift).max() < MOST_LATE_NS
+    assert after.fixes.geodetic[-len(before.fixes) :] == pytest.approx(before.fixes.geodetic, abs=1e-4)
+    assert after.fixes.quality.tolist() == before.fixes.quality.tolist()
+    assert len(after.frames) == len(before.frames)
+
+
+def test_what_cannot_be_replayed_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "data.jsonl").write_text("{}\n")
+    result = subprocess.run([*RIGTAPE, "replay", str(tmp_path / "rec")], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert "there is nothing in it" in result.stderr
+    result = subprocess.run(
+        [*RIGTAPE, "replay", str(tmp_path / "rec"), "--speed", "0"], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 2
+    assert "--speed 0: must be from 0.01 to 100" in result.stderr
