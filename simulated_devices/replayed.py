@@ -85,6 +85,7 @@ class SerialReplay:
             self._listen_until(host_ns)
             self._pty.send(data)
             self._pacer.done(host_ns)
+        self._listen_until(time.monotonic_ns() + SECOND_NS // 2)  # a hang-up would take away what was not read yet
 
     def _listen_until(self, host_ns: int) -> None:
         while time.monotonic_ns() < host_ns:
