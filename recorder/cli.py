@@ -6,13 +6,10 @@ Exit codes: 0 good; 1 it could not be done; 2 wrong use or a wrong configuration
 import contextlib
 import logging
 import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
 
 import click
 from rich.console import Console
@@ -20,7 +17,7 @@ from rich.progress import Progress
 
 from recorder import devices as attached
 from recorder import simulation
-from recorder.cli_errors import clear_errors
+from recorder.cli_common import Folder, RigFile, clear_errors, stop_on_signals
 from recorder.cli_formats import export, import_
 from recorder.decode import decode as decode_capture
 from recorder.errors import RecorderError
@@ -34,8 +31,6 @@ from recorder.session import record as record_take
 from recorder.skews import SkewStore, default_path
 from recorder.status import DecodeProgress, StatusDisplay, print_refinement, print_summary
 
-RigFile = click.Path(exists=True, dir_okay=False, path_type=Path)
-Folder = click.Path(file_okay=False, path_type=Path)
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a key path of the rig (repeatable)."
 )
@@ -55,10 +50,6 @@ def main(context: click.Context, verbose: bool) -> None:
     """
     context.obj = verbose
     logging.basicConfig(level=logging.DEBUG if verbose else logging.CRITICAL)
-
-
-main.add_command(export)
-main.add_command(import_)
 
 
 @main.command()
@@ -96,7 +87,7 @@ def record(
     if name is not None and (name in (".", "..") or Path(name).name != name):
         raise click.UsageError(f"--name {name}: must be a plain folder name")
     console = Console()
-    stop = _stop_on_signals(console)
+    stop = stop_on_signals(console)
     with clear_errors(verbose), _rig(rig, simulate, settings) as loaded, StatusDisplay(console) as display:
         folder, manifest = record_take(
             loaded,
@@ -142,19 +133,6 @@ def _rig(path: Path | None, simulate: bool, settings: tuple[str, ...]) -> Iterat
         yield parse_rig(simulated.yaml, "simulated rig", Path.cwd())
     finally:
         simulated.close()
-
-
-def _stop_on_signals(console: Console) -> threading.Event:
-    """An event that Ctrl-C or SIGTERM sets; asking again does not hurry what must be finished."""
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        console.print("finishing the files..." if not stop.is_set() else "still finishing the files, please wait...")
-        stop.set()
-
-    signal.signal(signal.SIGINT, on_signal)
-    signal.signal(signal.SIGTERM, on_signal)
-    return stop
 
 
 @main.command()
@@ -247,7 +225,7 @@ def decode(verbose: bool, capture: Path, driver: str, output: Path, settings: tu
       rigtape decode demo/2026-11-22T10-00-00Z/raw/gnss.pcapng --driver nmea -o again
     """
     console = Console()
-    stop = _stop_on_signals(console)
+    stop = stop_on_signals(console)
     with clear_errors(verbose), DecodeProgress(console) as display:
         decoded = decode_capture(
             capture,
@@ -331,6 +309,9 @@ def check(verbose: bool, recording: Path, as_json: bool, deep: bool) -> None:
         print_report(report, Console())
     sys.exit(report.exit_code)
 
+
+main.add_command(export)
+main.add_command(import_)
 
 if __name__ == "__main__":
     main()

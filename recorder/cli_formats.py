@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 from rich.progress import Progress
 
-from recorder.cli_errors import clear_errors
+from recorder.cli_common import clear_errors
 from recorder.formats import EXPORTERS, IMPORTERS, format_names
 from recorder.formats.report import Summary, print_formats_summary
 from recorder.formats.running import OnProgress
