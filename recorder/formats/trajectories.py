@@ -8,10 +8,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from recorder.formats import Exporter
-from recorder.formats.common import epoch_ns, needed_poses
+from recorder.formats.common import epoch_ns, needed_poses, rotation_matrices
 from recorder.formats.report import Report
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording
@@ -59,17 +58,6 @@ def seconds_text(time_ns: int) -> str:
     """Seconds with nine decimals, exact."""
     sign = "-" if time_ns < 0 else ""
     return f"{sign}{abs(time_ns) // NS_PER_S}.{abs(time_ns) % NS_PER_S:09d}"
-
-
-def rotation_matrices(wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(n, 3, 3) rotations of (n, 4) quaternions, which need not be of length one."""
-    w, x, y, z = (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 TUM = Exporter(TrajectoryOptions, write_tum)
