@@ -24,25 +24,27 @@ def paired_imu(recording: Recording, report: Report, where: str) -> ImuReadings:
     return readings
 
 
-def chosen_poses(recording: Recording, name: str) -> tuple[str, Poses] | None:
-    """The pose stream of that name; for "": groundTruth, else the only one there is, else None.
+def default_poses(recording: Recording) -> str:
+    """The name of groundTruth, else of the only pose stream there is, else ""."""
+    names = [name for name, poses in recording.poses.items() if len(poses)]
+    return GROUND_TRUTH if GROUND_TRUTH in names else names[0] if len(names) == 1 else ""
+
+
+def chosen_poses(recording: Recording, wanted: str) -> tuple[str, Poses] | None:
+    """Name and poses of the stream `wanted`, or of the default one; None where there are no poses.
 
     Raises FormatError when there is none of that name, or there are several and none is named.
     """
-    poses = {key: series for key, series in recording.poses.items() if len(series)}
-    known = ", ".join(poses) or "none"
-    if name and name not in poses:
-        raise FormatError(f"{recording.path}: no poses named {name} in it; there are: {known}")
-    if not name:
-        if GROUND_TRUTH in poses:
-            name = GROUND_TRUTH
-        elif len(poses) == 1:
-            (name,) = poses
-        elif not poses:
-            return None
-        else:
-            raise FormatError(f"{recording.path}: poses of several names; choose with --set poses=NAME: {known}")
-    return name, poses[name]
+    known = ", ".join(name for name, poses in recording.poses.items() if len(poses)) or "none"
+    name = wanted or default_poses(recording)
+    poses = recording.poses.get(name)
+    if poses is not None and len(poses):
+        return name, poses
+    if wanted:
+        raise FormatError(f"{recording.path}: no poses named {wanted} in it; there are: {known}")
+    if known == "none":
+        return None
+    raise FormatError(f"{recording.path}: poses of several names; choose with --set poses=NAME: {known}")
 
 
 def needed_poses(recording: Recording, name: str, format_name: str) -> tuple[str, Poses]:

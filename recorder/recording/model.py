@@ -96,6 +96,13 @@ class Recording:
         return self._data.fixes
 
     @property
+    def is_altitude_ellipsoidal(self) -> bool:
+        """Whether the altitudes of the fixes are above the ellipsoid, as the rig can say; else above mean sea level."""
+        devices = self.manifest.rig.get("devices") if self.manifest else None
+        entries = devices.values() if isinstance(devices, dict) else ()
+        return any(isinstance(entry, dict) and entry.get("altitude") == "ellipsoid" for entry in entries)
+
+    @property
     def frames(self) -> Frames:
         """The cameras' frame sets."""
         return self._data.frames

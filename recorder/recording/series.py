@@ -49,7 +49,7 @@ class Readings(Series):
 class Fixes(Series):
     """GNSS positions. What a fix does not say is NaN.
 
-    geodetic: (n, 3) latitude deg, longitude deg, altitude m (above mean sea level where undulation_m is known).
+    geodetic: (n, 3) latitude deg, longitude deg, altitude m (see Recording.is_altitude_ellipsoidal).
     accuracy_m: (n, 2) horizontal, vertical. undulation_m: (n,) geoid above the ellipsoid.
     quality: (n,) as in NMEA GGA (1 single, 2 differential, 4 RTK fixed, 5 RTK float). utc_ns: (n,) the receiver's own
     time, 0 where unknown.
