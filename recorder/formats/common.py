@@ -1,7 +1,6 @@
 """What exporters share: IMU readings in pairs, the pose stream to take, UTC."""
 
 import numpy as np
-import numpy.typing as npt
 
 from recorder.formats import FormatError
 from recorder.formats.report import Report
@@ -71,35 +70,3 @@ def rate_hz(series: Series) -> float | None:
     steps_ns = np.diff(series.time_ns)
     median_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
     return round(NS_PER_S / median_ns, 6) if median_ns > 0 else None
-
-
-def rotation_matrices(wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(n, 3, 3) rotations of (n, 4) quaternions, which need not be of length one."""
-    w, x, y, z = (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def rotation_matrix(wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(3, 3) rotation of one quaternion."""
-    return np.asarray(rotation_matrices(wxyz[None])[0], np.float64)
-
-
-def quaternion(rotation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(4,) unit quaternion w, x, y, z of a (3, 3) rotation, w >= 0: the eigenvector of Bar-Itzhack (2000)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    matrix = np.array(
-        (
-            (xx + yy + zz, 0, 0, 0),
-            (zy - yz, xx - yy - zz, 0, 0),
-            (xz - zx, xy + yx, yy - xx - zz, 0),
-            (yx - xy, xz + zx, yz + zy, zz - xx - yy),
-        )
-    )
-    _, vectors = np.linalg.eigh(matrix, UPLO="L")
-    found = vectors[:, 3]
-    return np.asarray(found if found[0] >= 0 else -found, np.float64)

@@ -20,10 +20,10 @@ from calibration.model import Calibration, Camera
 from calibration.model import Matrix as Matrix4
 from drivers.samples import FixSample, ImuSample, PoseSample
 from recorder.formats import FormatError, Importer, NoOptions, PictureSet, Source, Stream
-from recorder.formats.common import quaternion, rotation_matrix
 from recorder.formats.kalibr import native_lens, numbers, read_yaml
 from recorder.formats.png import Image, map_ahead, read_image
 from recorder.formats.report import Report
+from recorder.formats.rotations import from_matrix, matrices
 from recorder.formats.text import count_lines, fault, read_lines, read_table
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
@@ -129,9 +129,9 @@ def _poses(folder: Path, body_from_imu: Matrix) -> Iterator[tuple[int, PoseSampl
             raise fault(folder / "data.csv", number, f"the quaternion (w, x, y, z) has length {length:.3g}, not 1")
         position = np.array((x, y, z))
         if not is_same:
-            rotation = rotation_matrix(wxyz)
+            rotation = matrices(wxyz[None])[0]
             position = position + rotation @ sensor_from_imu[:3, 3]
-            wxyz = quaternion(rotation @ sensor_from_imu[:3, :3])
+            wxyz = from_matrix(rotation @ sensor_from_imu[:3, :3])
         px, py, pz = position.tolist()
         qw, qx, qy, qz = wxyz.tolist()
         yield time_ns, PoseSample(None, 0, (px, py, pz), (qw, qx, qy, qz))

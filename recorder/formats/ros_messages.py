@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from calibration.model import Camera
 from drivers.samples import POINT_DTYPE
-from recorder.formats.common import quaternion
 from recorder.formats.kalibr import kalibr_lens
+from recorder.formats.rotations import from_matrix
 from recorder.recording.manifest import NS_PER_S
 
 Floats = npt.NDArray[np.float64]
@@ -190,7 +190,7 @@ class Messages:
     def camera_transform(self, time_ns: int, child: str, camera: Camera) -> Any:
         """tf2_msgs/TFMessage: where a camera sits on the IMU."""
         imu_from_camera = np.linalg.inv(camera.matrix)
-        turn = quaternion(np.asarray(imu_from_camera[:3, :3], np.float64))
+        turn = from_matrix(np.asarray(imu_from_camera[:3, :3], np.float64))
         return self.transform(time_ns, "imu", child, np.asarray(imu_from_camera[:3, 3], np.float64), turn)
 
     def _make(self, kind: str, **values: Any) -> Any:

@@ -73,3 +73,30 @@ def from_rotation_vector(vectors: Floats) -> Floats:
     angle = np.linalg.norm(vectors, axis=1, keepdims=True)
     scale = np.where(angle > SMALL_RAD, np.sin(angle / 2) / np.maximum(angle, SMALL_RAD), 0.5)
     return np.concatenate([np.cos(angle / 2), vectors * scale], axis=1)
+
+
+def matrices(wxyz: Floats) -> Floats:
+    """Rotation matrices (n, 3, 3); the quaternions need not be of length one."""
+    w, x, y, z = (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def from_matrix(rotation: Floats) -> Floats:
+    """Quaternion (4,) of one rotation matrix (3, 3), w not negative: the eigenvector of Bar-Itzhack (2000)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    matrix = np.array(
+        (
+            (xx + yy + zz, 0, 0, 0),
+            (zy - yz, xx - yy - zz, 0, 0),
+            (xz - zx, xy + yx, yy - xx - zz, 0),
+            (yx - xy, xz + zx, yz + zy, zz - xx - yy),
+        )
+    )
+    _, vectors = np.linalg.eigh(matrix, UPLO="L")
+    found = vectors[:, 3]
+    return np.asarray(found if found[0] >= 0 else -found)

@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 
 from recorder.formats import Exporter
-from recorder.formats.common import epoch_ns, needed_poses, rotation_matrices
+from recorder.formats.common import epoch_ns, needed_poses
 from recorder.formats.report import Report
+from recorder.formats.rotations import matrices
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording
 from recorder.recording.series import Poses
@@ -39,10 +40,10 @@ def write_kitti(recording: Recording, out: Path, options: TrajectoryOptions, rep
     """One line for each pose. Raises FormatError when there are none."""
     poses = _turned_poses(recording, options, report, "kitti")
     report.note("the poses have no times, the format has no place for them")
-    matrices = np.concatenate([rotation_matrices(poses.orientation_wxyz), poses.position_m[:, :, None]], axis=2)
+    rows = np.concatenate([matrices(poses.orientation_wxyz), poses.position_m[:, :, None]], axis=2)
     with out.open("x", newline="\n") as file:
-        for matrix in matrices.reshape(-1, 12).tolist():
-            file.write(" ".join(map(repr, matrix)) + "\n")
+        for row in rows.reshape(-1, 12).tolist():
+            file.write(" ".join(map(repr, row)) + "\n")
 
 
 def _turned_poses(recording: Recording, options: TrajectoryOptions, report: Report, format_name: str) -> Poses:
