@@ -101,6 +101,8 @@ def _note_quality(recording: Recording, report: Report) -> None:
     for stream, count in recording.unordered.items():
         report.note(f"{stream}: {count} samples stood after later ones; they were put in order")
     if recording.manifest is not None:
+        if recording.manifest.state == "recording":
+            report.note("the recording was not finished (or is still running): `rigtape recover` saves all of it")
         imus = [name for name, device in recording.manifest.devices.items() if device.stream.kind == "imu"]
         if len(imus) > 1:
             report.note(

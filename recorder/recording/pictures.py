@@ -1,5 +1,6 @@
 """Pictures out of a recording's videos, by their number, and into them without loss."""
 
+import heapq
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -31,7 +32,7 @@ class VideoReader:
         """path: None for a video that is not there."""
         self.path = path
         self._container: InputContainer | None = None
-        self._frames: Iterator[VideoFrame] = iter(())
+        self._frames: Iterator[tuple[int, VideoFrame]] = iter(())
         self._next = 0
         self._last: tuple[int, VideoFrame] | None = None
         self._key_pts: dict[int, int] | None = None
@@ -83,14 +84,38 @@ class VideoReader:
             return self._last[1]
         self._stream()
         try:
-            for frame in self._frames:
-                self._last = (self._next, frame)
-                self._next += 1
-                if self._next > number:
+            for found, frame in self._frames:
+                self._last, self._next = (found, frame), found + 1
+                if found == number:
                     return frame
+                if found > number:
+                    raise self._fault(f"picture {number} cannot be decoded")
         except av.error.FFmpegError as error:
-            raise self._fault(f"picture {self._next} cannot be decoded: {error.strerror}") from error
+            self.close()
+            raise self._fault(f"picture {number} or one before it cannot be decoded: {error.strerror}") from error
         raise self._fault(f"picture {number} is not in it, it ends after {self._next}")
+
+    def _numbered(self, stream: VideoStream, known: dict[int, int] | None = None) -> Iterator[tuple[int, VideoFrame]]:
+        """Pictures with their number: of a damaged one the decoder may give none, so the time stamps are counted.
+
+        known: number by time stamp, where the file is not read from its beginning.
+        """
+        before: list[int] = []
+        number = -1
+        for packet in self._opened().demux(stream):
+            if packet.size and packet.pts is not None and known is None:
+                heapq.heappush(before, packet.pts)
+            for frame in packet.decode():
+                number += 1
+                if known is not None:
+                    number = known.get(frame.pts or 0, number)
+                elif frame.pts is not None:
+                    while before and before[0] < frame.pts:
+                        heapq.heappop(before)
+                        number += 1
+                    if before:
+                        heapq.heappop(before)
+                yield number, frame
 
     def _seek(self, number: int) -> None:
         """Go to `number`, or a picture before it; to the first one where the file's time stamps do not tell."""
@@ -100,14 +125,13 @@ class VideoReader:
         stream = self._stream()
         if number >= len(self._key_pts):
             return
-        order = {pts: index for index, pts in enumerate(self._key_pts)}
+        self._frames = self._numbered(stream, {pts: index for index, pts in enumerate(self._key_pts)})
         try:
             self._opened().seek(list(self._key_pts.values())[number], stream=stream)
-            frame = next(self._frames)
+            found, frame = next(self._frames)
         except (av.error.FFmpegError, StopIteration):
             self.close()
             return
-        found = order.get(frame.pts if frame.pts is not None else -1, number + 1)
         if found > number:
             self.close()
         else:
@@ -146,7 +170,7 @@ class VideoReader:
             raise self._fault("no video in it that can be decoded")
         if is_new:
             streams[0].thread_type = "AUTO"
-            self._frames = self._opened().decode(streams[0])
+            self._frames = self._numbered(streams[0])
         return streams[0]
 
     def _fault(self, text: str) -> StorageError:
