@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 Vector = tuple[float, float, float]
 
@@ -18,8 +19,7 @@ POINT_DTYPE = np.dtype(
 """One lidar point, 23 bytes packed: metres in the sensor frame (x forward, y left, z up), time in seconds."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImuSample:
+class ImuSample(Struct, frozen=True, gc=False):
     """One inertial reading in the sensor frame; what a packet did not carry is None.
 
     sequence: the device's message counter, None where it has none.
@@ -36,8 +36,7 @@ class ImuSample:
     temperature_k: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FixSample:
+class FixSample(Struct, frozen=True, gc=False):
     """One GNSS position, all sentences of one epoch together.
 
     device_ticks: UTC of the epoch in nanoseconds since 1970.
@@ -63,8 +62,7 @@ class FixSample:
     correction_age_s: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class PoseSample:
+class PoseSample(Struct, frozen=True, gc=False):
     """One pose of the rig from an outside source: world_from_device.
 
     position_m in a world frame with z up; orientation (w, x, y, z) unit quaternion, None where not sent.

@@ -79,6 +79,7 @@ class SerialLine:
         latest_ns = time.monotonic_ns() + _LONGEST_WAIT_NS
         due_ns = [due for stage in (self._uart, *self._holders) if (due := stage.next_due_ns()) is not None]
         self._pty.wait_until(min([latest_ns, *due_ns]))
+        self._pty.send(b"")  # what there was no room for
         now_ns = time.monotonic_ns()
         is_mute = False
         if not self._is_perfect:

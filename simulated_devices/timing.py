@@ -6,6 +6,7 @@ instant of a sample plus the transport delay gives when its message is due; `Pac
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import ctypes
 import fcntl
@@ -42,6 +43,7 @@ UART_CHUNK_BYTES = 64
 WORLD_START_DELAY_NS = SECOND_NS
 WORLD_START_STEP_NS = 100 * MILLISECOND_NS
 BACKLOG_NS = SECOND_NS
+PORT_BUFFER_BYTES = 65536  # what the system keeps of a serial port that is not read; of a pty it keeps a third of that
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
@@ -242,7 +244,7 @@ class UartTransmitter:
 class Pty:
     """A pseudo-terminal that behaves like a UART: what nobody listens to, or has room for, is lost.
 
-    unheard_bytes: sent while the other side was closed. lost_bytes: sent while its buffer was full.
+    unheard_bytes: sent while the other side was closed. lost_bytes: sent while the buffer of a port was full.
     """
 
     def __init__(self, link: Path) -> None:
@@ -251,6 +253,7 @@ class Pty:
         self.unheard_bytes = 0
         self.lost_bytes = 0
         self.is_plugged = False
+        self._held = bytearray()
         self._open()
         self.replug()
 
@@ -266,6 +269,7 @@ class Pty:
     def unplug(self) -> None:
         """Hang up, and take the name away; there is another terminal already, which nobody can know."""
         gone = self.fd
+        self._held.clear()
         self.is_plugged = False
         self.path.unlink(missing_ok=True)
         self._open()
@@ -287,15 +291,18 @@ class Pty:
         return speed
 
     def send(self, data: bytes) -> None:
-        """Make bytes readable, or lose them."""
-        if not self.is_open():
-            self.unheard_bytes += len(data)
+        """Make bytes readable, as far as there is room: the rest is held for later calls, or lost."""
+        self._held += data
+        if not self._held:
             return
-        try:
-            written = os.write(self.fd, data)
-        except OSError:  # full (EAGAIN), or closed this very moment
-            written = 0
-        self.lost_bytes += len(data) - written
+        if not self.is_open():
+            self.unheard_bytes += len(self._held)
+            self._held.clear()
+            return
+        with contextlib.suppress(OSError):  # full (EAGAIN), or closed this very moment
+            del self._held[: os.write(self.fd, self._held)]
+        self.lost_bytes += len(self._held[PORT_BUFFER_BYTES:])
+        del self._held[PORT_BUFFER_BYTES:]
 
     def receive(self) -> bytes:
         """What the other side has sent, b"" for nothing."""

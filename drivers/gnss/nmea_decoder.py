@@ -11,15 +11,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
+
+from msgspec import Struct
 
 from drivers.gnss.nmea_scanner import SentenceScanner
 from drivers.samples import FixSample
 
 EMITTED_QUALITIES = frozenset((1, 2, 3, 4, 5, 9))  # not: none, dead reckoning, manual, simulator
-QUALITY_OF_RMC_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 QUALITY_RANK = (4, 5, 9, 3, 2, 1, 6, 8, 7)  # best first
-QUALITY_OF_GNS_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
+QUALITY_OF_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 6: 20.0, 9: 2.5}
 """Horizontal error, one sigma, for a dilution of 1, by quality: rough, from what receivers with GST say."""
 VERTICAL_PER_HORIZONTAL = 2.0
@@ -29,11 +30,9 @@ NS_PER_S = 1_000_000_000
 DAY_NS = 86_400 * NS_PER_S
 ROLLOVER_NS = 1024 * 7 * DAY_NS
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
-_TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
-_COORDINATE = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)")
+_LATITUDE_LONGITUDE = re.compile(rb"(\d{1,2})(\d\d(?:\.(\d*))?),([NS]),(\d{1,3})(\d\d(?:\.\d*)?),([EW])")
 
-TIME_FIELD = {b"GGA": 1, b"RMC": 1, b"GST": 1, b"ZDA": 1, b"GNS": 1, b"GBS": 1, b"GRS": 1, b"GLL": 5}
 Source = Literal["gst", "dop", "none"]
 
 
@@ -52,8 +51,7 @@ class FixRules:
     vertical_per_horizontal: float = VERTICAL_PER_HORIZONTAL
 
 
-@dataclass(slots=True)
-class _Position:
+class _Position(Struct, gc=False):
     """What GGA says, or RMC in its place."""
 
     is_multi_system: bool
@@ -74,31 +72,29 @@ class _Position:
             return None
         return self.altitude_m + self.undulation_m
 
-    def is_better_than(self, other: "_Position | None") -> bool:
-        if other is None:
-            return True
+    def is_better_than(self, other: "_Position") -> bool:
         if other.is_multi_system or self.is_multi_system:
             return not other.is_multi_system
         return QUALITY_RANK.index(self.quality) < QUALITY_RANK.index(other.quality)
 
 
-@dataclass(slots=True)
-class _Epoch:
+class _Epoch(Struct):
     """Sentences with one UTC time of day.
 
-    seen: how often each came; tail: the last one. is_incomplete: something came after it was taken to be over.
+    seen: how often each of the fix came, by its address; tail: the last of them.
+    is_incomplete: something came after it was taken to be over.
     """
 
     day_ns: int
     offset: int
     gga: _Position | None = None
     is_refused: bool = False
-    rmc: list[str] | None = None
+    rmc: list[bytes] | None = None
     gns: _Position | None = None
     date_ns: int | None = None
     sigmas_m: tuple[float, float | None] | None = None
-    seen: dict[str, int] = field(default_factory=dict)
-    tail: tuple[str, int] | None = None
+    seen: dict[bytes, int] = {}
+    tail: bytes | None = None
     is_over: bool = False
     has_fix: bool = False
     is_incomplete: bool = False
@@ -123,9 +119,9 @@ class NmeaDecoder:
     scanner: SentenceScanner = field(default_factory=SentenceScanner)
     _epoch: _Epoch | None = None
     _last_utc_ns: int | None = None
-    _ender: tuple[str, int] | None = None
-    _previous_tail: tuple[str, int] | None = None
-    _time_text: str | None = None
+    _ender: tuple[bytes, int] | None = None
+    _previous_tail: tuple[bytes, int] | None = None
+    _time_text: bytes | None = None
     _time_ns: int | None = None
 
     @property
@@ -144,8 +140,8 @@ class NmeaDecoder:
         sentences = self.scanner.feed(data)
         self.sentences += len(sentences)
         for offset, body in sentences:
-            if (place := TIME_FIELD.get(body[2:5])) is not None and body[5:6] == b",":
-                self._take(offset, body, place, fixes)
+            if (kind := _KINDS.get(body[2:6])) is not None:
+                self._take(offset, body, kind, fixes)
         return fixes
 
     def flush(self) -> list[FixSample]:
@@ -154,36 +150,31 @@ class NmeaDecoder:
         self._close(fixes)
         return fixes
 
-    def _take(self, offset: int, body: bytes, place: int, fixes: list[FixSample]) -> None:
-        """A sentence with the time in the field at `place`."""
-        fields = body.decode("ascii").split(",")
-        if place >= len(fields):
+    def _take(self, offset: int, body: bytes, kind: "_Kind", fixes: list[FixSample]) -> None:
+        time_field, gather, is_of_fix = kind
+        fields = body.split(b",")
+        if time_field >= len(fields):
             return
-        if fields[place] != self._time_text:
-            self._time_text = fields[place]
+        if fields[time_field] != self._time_text:
+            self._time_text = fields[time_field]
             self._time_ns = _time_of_day_ns(self._time_text)
-        day_ns = self._time_ns
-        if day_ns is None:
+        if self._time_ns is None:
             return
-        if self._epoch is None or self._epoch.day_ns != day_ns:
+        epoch = self._epoch
+        if epoch is None or epoch.day_ns != self._time_ns:
             self._close(fixes)
             self._learn()
-            self._epoch = _Epoch(day_ns, offset)
-        if (gather := _GATHER.get(body[2:5])) is not None:
-            gather(self._epoch, fields, self.rules)
-            if (
-                gather is not _gather_zda
-            ):  # it brings a date only, often once a second: it must neither end nor spoil an epoch
-                self._mark(fields[0], fixes)
-
-    def _mark(self, address: str, fixes: list[FixSample]) -> None:
-        """Note that a sentence of the fix has come, and close the epoch when it is the one that ends the cycle."""
-        epoch = self._epoch
-        assert epoch is not None
-        epoch.is_incomplete |= epoch.is_over
+            epoch = self._epoch = _Epoch(self._time_ns, offset)
+        if gather is not None:
+            gather(epoch, fields, self.rules)
+        if not is_of_fix:
+            return
+        address = fields[0]
         count = epoch.seen[address] = epoch.seen.get(address, 0) + 1
-        epoch.tail = (address, count)
-        if epoch.tail == self._ender:
+        epoch.tail = address
+        if epoch.is_over:
+            epoch.is_incomplete = True
+        elif self._ender is not None and self._ender == (address, count):
             self._close(fixes)
 
     def _learn(self) -> None:
@@ -196,11 +187,12 @@ class NmeaDecoder:
             return
         if epoch.has_fix:
             self._last_utc_ns = self._utc_ns(epoch)
-        if epoch.tail == self._previous_tail:
-            self._ender = epoch.tail
+        tail = (epoch.tail, epoch.seen[epoch.tail])
+        if tail == self._previous_tail:
+            self._ender = tail
         elif epoch.is_incomplete:
             self._ender = None
-        self._previous_tail = epoch.tail
+        self._previous_tail = tail
 
     def _close(self, fixes: list[FixSample]) -> None:
         epoch = self._epoch
@@ -241,76 +233,53 @@ class NmeaDecoder:
         return epoch.day_ns + _rounded(near_ns - epoch.day_ns, DAY_NS) * DAY_NS
 
 
-def _gather_gga(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
+def _gather_gga(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     quality = _integer(fields[6]) if len(fields) >= 12 else None
     if quality is None:  # receivers that leave it empty say with RMC whether the position is good
         return
     if quality not in rules.qualities:
         epoch.is_refused = True
         return
-    latitude_deg, longitude_deg = _coordinates(fields[2:6])
-    if latitude_deg is None or longitude_deg is None:
-        return
-    position = _Position(
-        is_multi_system=fields[0].startswith("GN"),
-        quality=quality,
-        latitude_deg=latitude_deg,
-        longitude_deg=longitude_deg,
-        altitude_m=_number(fields[9], -2_000, 100_000) if fields[10] in ("M", "") else None,
-        undulation_m=_number(fields[11], -200, 200),
-        satellites=_integer(fields[7]),
-        hdop=_number(fields[8], 0, MAX_HDOP),
-        correction_age_s=_number(fields[13], 0, 1e6) if len(fields) > 13 else None,
-        decimals=_decimals(fields[2]),
-    )
-    if position.is_better_than(epoch.gga):
+    age_s = _number(fields[13], 0, 1e6) if len(fields) > 13 else None
+    altitude_m = _number(fields[9], -2_000, 100_000) if fields[10] in (b"M", b"") else None
+    undulation_m = _number(fields[11], -200, 200)
+    position = _position(fields, 2, quality, altitude_m, undulation_m, fields[7], fields[8], age_s)
+    if position is not None and (epoch.gga is None or position.is_better_than(epoch.gga)):
         epoch.gga = position
 
 
-def _gather_rmc(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
-    if len(fields) < 10 or fields[2] != "A":  # a void sentence may carry any date
+def _gather_gns(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
+    """One mode letter for each satellite system; the position is as good as the best of them."""
+    if len(fields) < 11:
         return
-    epoch.date_ns = _date_ns(fields[9][:2], fields[9][2:4], fields[9][4:])
+    qualities = [QUALITY_OF_MODE[letter] for letter in fields[6].decode("ascii") if letter in QUALITY_OF_MODE]
+    if not qualities:
+        return
+    quality = min(qualities, key=QUALITY_RANK.index)
+    age_s = _number(fields[11], 0, 1e6) if len(fields) > 11 else None
+    altitude_m, undulation_m = _number(fields[9], -2_000, 100_000), _number(fields[10], -200, 200)
+    position = _position(fields, 2, quality, altitude_m, undulation_m, fields[7], fields[8], age_s)
+    if position is not None and (epoch.gns is None or position.is_better_than(epoch.gns)):
+        epoch.gns = position
+
+
+def _gather_rmc(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
+    if len(fields) < 10 or fields[2] != b"A":  # a void sentence may carry any date
+        return
+    epoch.date_ns = _short_date_ns(fields[9])
     if fields[3] and fields[5]:
         epoch.rmc = fields
 
 
-def _position_of_rmc(fields: list[str] | None) -> _Position | None:
+def _position_of_rmc(fields: list[bytes] | None) -> _Position | None:
     """Made only where there is no better sentence."""
     if fields is None:
         return None
-    quality = QUALITY_OF_RMC_MODE.get(fields[12], 0) if len(fields) > 12 else 1
-    latitude_deg, longitude_deg = _coordinates(fields[3:7])
-    if latitude_deg is None or longitude_deg is None:
-        return None
-    return _Position(fields[0].startswith("GN"), quality, latitude_deg, longitude_deg, decimals=_decimals(fields[3]))
+    quality = QUALITY_OF_MODE.get(fields[12].decode("ascii"), 0) if len(fields) > 12 else 1
+    return _position(fields, 3, quality)
 
 
-def _gather_gns(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
-    """One mode letter for each satellite system; the position is as good as the best of them."""
-    if len(fields) < 11:
-        return
-    qualities = [QUALITY_OF_GNS_MODE[letter] for letter in fields[6] if letter in QUALITY_OF_GNS_MODE]
-    latitude_deg, longitude_deg = _coordinates(fields[2:6])
-    if not qualities or latitude_deg is None or longitude_deg is None:
-        return
-    position = _Position(
-        is_multi_system=fields[0].startswith("GN"),
-        quality=min(qualities, key=QUALITY_RANK.index),
-        latitude_deg=latitude_deg,
-        longitude_deg=longitude_deg,
-        altitude_m=_number(fields[9], -2_000, 100_000),
-        undulation_m=_number(fields[10], -200, 200),
-        satellites=_integer(fields[7]),
-        hdop=_number(fields[8], 0, MAX_HDOP),
-        correction_age_s=_number(fields[11], 0, 1e6) if len(fields) > 11 else None,
-        decimals=_decimals(fields[2]),
-    )
-    if position.is_better_than(epoch.gns):
-        epoch.gns = position
-
-
-def _gather_gst(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
+def _gather_gst(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if len(fields) < 9:
         return
     latitude_m, longitude_m = _number(fields[6], 0, 1e6), _number(fields[7], 0, 1e6)
@@ -318,17 +287,32 @@ def _gather_gst(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
         epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), _number(fields[8], 0, 1e6))
 
 
-def _gather_zda(epoch: _Epoch, fields: list[str], rules: FixRules) -> None:
+def _gather_zda(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if len(fields) >= 5 and epoch.date_ns is None:
-        epoch.date_ns = _date_ns(*fields[2:5])
+        epoch.date_ns = _date_ns(fields[2], fields[3], fields[4])
 
 
-_GATHER: dict[bytes, Callable[[_Epoch, list[str], FixRules], None]] = {
-    b"GGA": _gather_gga,
-    b"GNS": _gather_gns,
-    b"RMC": _gather_rmc,
-    b"GST": _gather_gst,
-    b"ZDA": _gather_zda,
+class _Kind(NamedTuple):
+    """A kind of sentence: which field is its time, and what is taken from it.
+
+    is_of_fix: it belongs to each fix. ZDA brings a date only, often once a second: it must neither end nor spoil an
+    epoch.
+    """
+
+    time_field: int
+    gather: Callable[[_Epoch, list[bytes], FixRules], None] | None = None
+    is_of_fix: bool = False
+
+
+_KINDS = {
+    b"GGA,": _Kind(1, _gather_gga, True),
+    b"GNS,": _Kind(1, _gather_gns, True),
+    b"RMC,": _Kind(1, _gather_rmc, True),
+    b"GST,": _Kind(1, _gather_gst, True),
+    b"ZDA,": _Kind(1, _gather_zda),
+    b"GBS,": _Kind(1),
+    b"GRS,": _Kind(1),
+    b"GLL,": _Kind(5),
 }
 
 
@@ -343,47 +327,77 @@ def _accuracy(
     return accuracy_m, accuracy_m * rules.vertical_per_horizontal, "dop"
 
 
-def _number(text: str, low: float, high: float) -> float | None:
+@lru_cache(maxsize=256)  # most numbers of an epoch are those of the one before
+def _number(text: bytes, low: float, high: float) -> float | None:
     if not _NUMBER.fullmatch(text):
         return None
     value = float(text)
     return value if low <= value <= high else None
 
 
-def _decimals(text: str) -> int:
-    return len(text.partition(".")[2])
-
-
-def _integer(text: str) -> int | None:
+@lru_cache(maxsize=64)
+def _integer(text: bytes) -> int | None:
     return int(text) if text.isdigit() and len(text) <= 4 else None
 
 
-def _coordinates(fields: list[str]) -> tuple[float | None, float | None]:
-    return _degrees(fields[0], fields[1], "NS", 90), _degrees(fields[2], fields[3], "EW", 180)
-
-
-def _degrees(text: str, hemisphere: str, letters: str, limit: int) -> float | None:
-    match = _COORDINATE.fullmatch(text)
-    if match is None or len(hemisphere) != 1 or hemisphere not in letters or (minutes := float(match[2])) >= 60:
-        return None
-    degrees = int(match[1]) + minutes / 60
-    if degrees > limit:
-        return None
-    return degrees if hemisphere == letters[0] else -degrees
-
-
-def _time_of_day_ns(text: str) -> int | None:
-    match = _TIME.fullmatch(text)
+def _position(
+    fields: list[bytes],
+    place: int,
+    quality: int,
+    altitude_m: float | None = None,
+    undulation_m: float | None = None,
+    satellites: bytes = b"",
+    hdop: bytes = b"",
+    correction_age_s: float | None = None,
+) -> _Position | None:
+    """With latitude and longitude in the four fields from `place` on; None where they are none."""
+    match = _LATITUDE_LONGITUDE.fullmatch(b",".join(fields[place : place + 4]))
     if match is None:
         return None
-    hour, minute, second = int(match[1]), int(match[2]), int(match[3])
-    if hour > 23 or minute > 59 or second > 60:  # a leap second is 23:59:60, the same instant as 0:00 of the next day
+    degrees, minutes, decimals, north_south, east_degrees, east_minutes, east_west = match.groups()
+    latitude_deg = int(degrees) + float(minutes) / 60
+    longitude_deg = int(east_degrees) + float(east_minutes) / 60
+    if latitude_deg > 90 or longitude_deg > 180 or minutes >= b"60" or east_minutes >= b"60":
         return None
-    return (hour * 3600 + minute * 60 + second) * NS_PER_S + int((match[4] or "")[:9].ljust(9, "0"))
+    return _Position(
+        fields[0].startswith(b"GN"),
+        quality,
+        latitude_deg if north_south == b"N" else -latitude_deg,
+        longitude_deg if east_west == b"E" else -longitude_deg,
+        altitude_m,
+        undulation_m,
+        _integer(satellites),
+        _number(hdop, 0, MAX_HDOP),
+        correction_age_s,
+        len(decimals or b""),
+    )
+
+
+def _time_of_day_ns(text: bytes) -> int | None:
+    """Of hhmmss and any number of decimals; a leap second is 23:59:60, the same instant as 0:00 of the next day."""
+    minute_ns = _minute_of_day_ns(text[:4])
+    if minute_ns is None or not text[4:6].isdigit() or text[6:7] not in (b"", b"."):
+        return None
+    second, decimals = int(text[4:6]), text[7:]
+    if second > 60 or not (decimals.isdigit() or not decimals):
+        return None
+    return minute_ns + second * NS_PER_S + int(decimals[:9].ljust(9, b"0"))
 
 
 @lru_cache(maxsize=8)
-def _date_ns(day: str, month: str, year: str) -> int | None:
+def _minute_of_day_ns(text: bytes) -> int | None:
+    if not text.isdigit() or len(text) != 4 or (hour := int(text[:2])) > 23 or (minute := int(text[2:])) > 59:
+        return None
+    return (hour * 60 + minute) * 60 * NS_PER_S
+
+
+@lru_cache(maxsize=8)
+def _short_date_ns(text: bytes) -> int | None:
+    return _date_ns(text[:2], text[2:4], text[4:])
+
+
+@lru_cache(maxsize=8)
+def _date_ns(day: bytes, month: bytes, year: bytes) -> int | None:
     if not (day.isdigit() and month.isdigit() and year.isdigit() and len(year) in (2, 4)):
         return None
     full_year = int(year) if len(year) == 4 else int(year) + (2000 if int(year) < 80 else 1900)

@@ -4,12 +4,18 @@ import re
 from dataclasses import dataclass, field
 from itertools import accumulate
 
+import numpy as np
+
 MAX_SENTENCE_BYTES = 512  # the standard says 82; high-precision receivers do not keep to it
 MAX_UBX_PAYLOAD_BYTES = 4096
 _START = re.compile(rb"[$!\xb5\xd3]")
 _BODY = re.compile(rb"[\x20-\x23\x25-\x29\x2b-\x7e]*")  # printable, neither $ nor *
 _CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
-_WHOLE = re.compile(rb"[\r\n]*(\$)([\x20-\x23\x25-\x29\x2b-\x7e]{0,%d})\*([0-9A-Fa-f]{2})" % (MAX_SENTENCE_BYTES - 2))
+# Whole sentences in a row; so many, that after a bad one among them not too much is looked at again.
+_RUN = re.compile(
+    rb"[\r\n]*(?:\$[\x20-\x23\x25-\x29\x2b-\x7e]{0,%d}\*[0-9A-Fa-f]{2}[\r\n]*){1,64}" % (MAX_SENTENCE_BYTES - 2)
+)
+SHORT_RUN_BYTES = 200
 
 Sentence = tuple[int, bytes]
 """A sentence with a good checksum: how many bytes were fed before it, and what is between $ and *."""
@@ -33,13 +39,10 @@ class SentenceScanner:
         sentences: list[Sentence] = []
         position = 0
         while True:
-            whole = _WHOLE.match(self._buffer, position)
-            if whole is not None:
-                body, checksum = whole.group(2, 3)
-                if _xor(body) == _HEX[checksum]:
-                    sentences.append((self._buffer_offset + whole.start(1), body))
-                    position = whole.end()
-                    continue
+            if (run := _RUN.match(self._buffer, position)) is not None:
+                position += self._take_run(run[0], position, sentences)
+                if position == len(self._buffer):
+                    break
             match = _START.search(self._buffer, position)
             if match is None:
                 self._skip(position, len(self._buffer))
@@ -51,7 +54,7 @@ class SentenceScanner:
             if length is None:
                 break
             if length == 0:  # no message begins here
-                self._skip(position, position + 1)
+                self.skipped_bytes += 1
                 position += 1
                 continue
             if self._buffer[position] == ord("$"):
@@ -61,6 +64,21 @@ class SentenceScanner:
         del self._buffer[:position]
         self._buffer_offset += position
         return sentences
+
+    def _take_run(self, run: bytes, position: int, sentences: list[Sentence]) -> int:
+        """Take the sentences of a run up to the first with a wrong checksum; gives how many bytes these are."""
+        line_ends, *pieces = run.split(b"$")
+        start = len(line_ends)
+        offset = self._buffer_offset + position
+        xor = b"" if len(run) < SHORT_RUN_BYTES else np.bitwise_xor.accumulate(np.frombuffer(run, np.uint8)).tobytes()
+        for piece in pieces:
+            body, _, rest = piece.partition(b"*")
+            checksum = xor[start] ^ xor[start + len(body)] if xor else _xor(body)
+            if checksum != _HEX[rest[:2]]:
+                return start
+            sentences.append((offset + start, body))
+            start += len(piece) + 1
+        return len(run)
 
     def _skip(self, start: int, end: int) -> None:
         if start == end:

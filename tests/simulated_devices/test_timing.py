@@ -151,7 +151,16 @@ def test_a_pty_is_raw_and_loses_what_nobody_hears_or_has_room_for(tmp_path):
             assert pty.receive() == b""
             for _ in range(1000):
                 pty.send(bytes(64))
+            assert pty.lost_bytes == 0
+            for _ in range(1000):
+                pty.send(bytes(64))
             assert 0 < pty.lost_bytes < 64_000
+            kept = 0
+            while data := os.read(reader, 1 << 20):
+                kept += len(data)
+                pty.send(b"")
+                if kept + pty.lost_bytes == 128_000:
+                    break
         finally:
             os.close(reader)
         assert not pty.is_open()
