@@ -11,7 +11,7 @@ from collections.abc import Callable
 from drivers.gnss.nmea_scanner import SentenceScanner
 from drivers.imu.ascii_decoder import MAX_LINE_BYTES
 from drivers.imu.mip_decoder import MipDecoder
-from drivers.imu.mtdata2 import XbusFramer
+from drivers.imu.mtdata2 import xbus_framer
 from drivers.imu.rvc_decoder import FRAME_BYTES as RVC_BYTES
 from drivers.imu.rvc_decoder import RvcDecoder
 from drivers.imu.vectornav_decoder import VectornavDecoder
@@ -56,9 +56,8 @@ def _finding(driver: str, what: str, frames: int, needed: int, explained: int, d
 
 
 def _xsens(data: bytes) -> Finding | None:
-    framer = XbusFramer()
-    frames = framer.feed(data)
-    explained = sum(len(payload) + 5 for _, payload in frames)
+    frames = xbus_framer().feed(data)
+    explained = sum(len(frame) for _, frame in frames)
     return _finding("xsens", "Xsens XBus frames", len(frames), MIN_FRAMES, explained, data)
 
 

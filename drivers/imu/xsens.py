@@ -17,7 +17,7 @@ from drivers.imu.mtdata2 import (
     SAMPLE_TIME_FINE,
     SAMPLE_TIME_FINE_HZ,
     TEMPERATURE,
-    Frame,
+    Message,
     Mtdata2Decoder,
 )
 from drivers.links import SerialPort
@@ -162,11 +162,11 @@ class XsensDriver(SerialDriver[Mtdata2Decoder]):
 DRIVER = DriverType(config=XsensConfig, create=XsensDriver)
 
 
-def ask(dialogue: Dialogue[Frame], message: tuple[str, int], payload: bytes = b"") -> bytes:
+def ask(dialogue: Dialogue[Message], message: tuple[str, int], payload: bytes = b"") -> bytes:
     """The payload of the device's answer. Raises DeviceError when there is none, or it refuses."""
     name, message_id = message
 
-    def answer(frame: Frame) -> bytes | None:
+    def answer(frame: Message) -> bytes | None:
         if frame[0] == ERROR:
             raise RefusedError(_error_text(frame[1]))
         return frame[1] if frame[0] == message_id + 1 else None

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from drivers import links, serial_care
 from drivers.device import DeviceError
-from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder, XbusFramer, decode_mtdata2, mtdata2_items
+from drivers.imu.mtdata2 import MAX_PAYLOAD_BYTES, Mtdata2Decoder, decode_mtdata2, message, mtdata2_items, xbus_framer
 from drivers.imu.xsens import DRIVER, XsensConfig, XsensDriver
 from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample, Vector
 
@@ -55,7 +55,7 @@ def golden_packets(text: str) -> list[dict[str, list[float]]]:
 def test_agrees_with_another_decoder_on_captures(capture: str) -> None:
     data = (DATA / f"{capture}.bin").read_bytes()
     packets = golden_packets((DATA / f"{capture}.golden").read_text())
-    frames = XbusFramer().feed(data)
+    frames = [message(whole) for _, whole in xbus_framer().feed(data)]
     assert len(frames) == len(packets) == 100
     for (message_id, payload), packet in zip(frames, packets, strict=True):
         sample = decode_mtdata2(payload)
@@ -128,15 +128,16 @@ def test_extended_frames() -> None:
     (sample,) = Mtdata2Decoder().feed(frame(0x36, payload, extended=True))
     assert sample.sequence == 7
     longest = frame(0x05, bytes(MAX_PAYLOAD_BYTES), extended=True)
-    assert XbusFramer().feed(longest) == [(0x05, bytes(MAX_PAYLOAD_BYTES))]
-    framer = XbusFramer()
-    assert framer.feed(b"\xfa\xff\x36\xff\x08\x01" + EXAMPLE) == [(0x36, EXAMPLE[4:-1])]
+    ((start, whole),) = xbus_framer().feed(longest)
+    assert (start, message(whole)) == (0, (0x05, bytes(MAX_PAYLOAD_BYTES)))
+    framer = xbus_framer()
+    assert framer.feed(b"\xfa\xff\x36\xff\x08\x01" + EXAMPLE) == [(6, EXAMPLE)]
     assert (framer.bad_frames, framer.skipped_bytes) == (1, 6)
 
 
 def test_false_preamble_does_not_hide_the_frame_inside() -> None:
-    framer = XbusFramer()
-    assert framer.feed(b"\xfa\xff\x36\x20" + EXAMPLE) == [(0x36, EXAMPLE[4:-1])]
+    framer = xbus_framer()
+    assert framer.feed(b"\xfa\xff\x36\x20" + EXAMPLE) == [(4, EXAMPLE)]
     assert (framer.bad_frames, framer.skipped_bytes) == (1, 4)
 
 
@@ -144,7 +145,7 @@ def test_false_preamble_with_a_fitting_checksum_does_not_hide_the_frame_inside()
     head = b"\xff\x36" + bytes((len(EXAMPLE) + 1,))
     false = b"\xfa" + head + b"\0" + EXAMPLE
     false += bytes((-sum(head + EXAMPLE) & 0xFF,))
-    assert XbusFramer().feed(false) == [(0x36, EXAMPLE[4:-1])]
+    assert xbus_framer().feed(false) == [(5, EXAMPLE)]
 
 
 def test_every_changed_bit_is_noticed() -> None:

@@ -63,7 +63,7 @@ TARGETS = {
         MAX_PAYLOAD_BYTES + 7,
         bytes.fromhex("FAFF361B10200200071060040057472E40200C000000003F80000041200000AB"),
         lambda sample: sample.device_ticks,
-        lambda decoder: len(decoder.framer._buffer),
+        waiting_in_framer,
     ),
     "vectornav": Target(
         VectornavDecoder,

@@ -1,6 +1,5 @@
 """data.jsonl: lines in, a file out that ascends, tells no lies about the disk, and has no NaN."""
 
-import dataclasses
 import hashlib
 import json
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from drivers.samples import POINT_DTYPE, FixSample, ImuSample, PoseSample, ScanSample
 from recorder.recording.jsonl import (
@@ -101,7 +101,7 @@ def test_fix_has_the_formats_keys_and_no_null():
 @pytest.mark.parametrize("missing", ["altitude_m", "accuracy_m", "vertical_accuracy_m"])
 @pytest.mark.parametrize("value", [None, NAN, float("inf")])
 def test_a_fix_that_lacks_what_the_format_needs_gives_no_line(missing, value):
-    assert fix_line(0, dataclasses.replace(FIX, **{missing: value})) is None
+    assert fix_line(0, replace(FIX, **{missing: value})) is None
 
 
 def test_pose_goes_under_its_name():
@@ -115,7 +115,7 @@ def test_pose_goes_under_its_name():
     }
     assert (
         "orientation"
-        not in json.loads(pose_line(0, "mocap", dataclasses.replace(pose, orientation_wxyz=None)))["mocap"]
+        not in json.loads(pose_line(0, "mocap", replace(pose, orientation_wxyz=None)))["mocap"]
     )
 
 
@@ -125,8 +125,8 @@ def test_what_is_not_a_number_gets_no_line():
     assert imu_lines(0, ImuSample(0, 0, None, (0.0, 0.0, 0.0), None, NAN)) == []
     assert pose_line(0, "mocap", PoseSample(0, 0, (0.0, 0.0, NAN), None)) is None
     assert pose_line(0, "mocap", PoseSample(0, 0, (0.0, 0.0, 0.0), (NAN, 0.0, 0.0, 0.0))) is None
-    assert fix_line(0, dataclasses.replace(FIX, latitude_deg=NAN)) is None
-    assert "hdop" not in json.loads(fix_line(0, dataclasses.replace(FIX, hdop=NAN)))["fix"]
+    assert fix_line(0, replace(FIX, latitude_deg=NAN)) is None
+    assert "hdop" not in json.loads(fix_line(0, replace(FIX, hdop=NAN)))["fix"]
 
 
 def test_a_partial_scan_says_so():

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from drivers.device import DeviceConfig
 from drivers.samples import (
@@ -367,11 +368,11 @@ def test_samples_that_lack_what_the_format_needs_are_counted(tmp_path, read_line
     for device, arrival_ns, sample in every_stream(0.5):
         match sample:
             case ImuSample(sequence=7):
-                sample = replace(sample, accel_m_s2=(nan, 0.0, 0.0))
+                sample = structs.replace(sample, accel_m_s2=(nan, 0.0, 0.0))
             case FixSample() if arrival_ns < 100 * MS:
-                sample = replace(sample, altitude_m=None)
+                sample = structs.replace(sample, altitude_m=None)
             case PoseSample(sequence=3):
-                sample = replace(sample, position_m=(0.0, nan, 0.0))
+                sample = structs.replace(sample, position_m=(0.0, nan, 0.0))
             case ScanSample() if arrival_ns < 200 * MS:
                 sample = ScanSample(sample.points[:0], 77 * S, 77 * S, 100, 0, 0, is_partial=False)
         arrivals.append((device, arrival_ns, sample))
