@@ -113,10 +113,7 @@ def test_pose_goes_under_its_name():
         },
         "time": 0.0,
     }
-    assert (
-        "orientation"
-        not in json.loads(pose_line(0, "mocap", replace(pose, orientation_wxyz=None)))["mocap"]
-    )
+    assert "orientation" not in json.loads(pose_line(0, "mocap", replace(pose, orientation_wxyz=None)))["mocap"]
 
 
 def test_what_is_not_a_number_gets_no_line():
