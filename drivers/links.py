@@ -18,9 +18,9 @@ import termios
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import repeat
 
 import numpy as np
 import serial
@@ -28,7 +28,7 @@ import serial
 from drivers.device import DeviceError
 from drivers.garbage import CountsBadInput, GarbageWatch
 from drivers.ports import Links, SerialPort, UdpOptions, UdpPorts
-from drivers.samples import Chunk, DeviceEvent
+from drivers.samples import Chunk, Datagrams, DeviceEvent
 from drivers.serial_ports import find_port
 from drivers.udp_batches import SLOTS, BatchReceiver
 
@@ -232,7 +232,7 @@ class UdpLink:
             raise DeviceError(f"UDP port {port} on {bind_address}: {_reason(error)}{_advice(error)}") from error
         return udp
 
-    def read(self, timeout_s: float) -> list[Chunk]:
+    def read(self, timeout_s: float) -> Sequence[Chunk]:
         """What has come on all ports, in order of arrival; empty after `timeout_s`."""
         events = self._readable.poll(0 if self._given else _milliseconds(timeout_s))
         if not events and not self._given:
@@ -240,23 +240,22 @@ class UdpLink:
         offset_ns = _realtime_minus_monotonic_ns()
         wall_clock_was_set = abs(offset_ns - self._realtime_minus_monotonic_ns) > WALL_CLOCK_STEP_NS
         self._realtime_minus_monotonic_ns = offset_ns
-        chunks: list[Chunk] = []
+        parts: list[Sequence[Chunk]] = []
         for descriptor, _ in events:
             # What waits may have been stamped before the wall clock was set: then the time of reading is the truth.
             with self._shared[descriptor].lock if descriptor in self._shared else contextlib.nullcontext():
-                self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns, chunks)
-        given = bool(self._given)
-        while self._given:
-            chunks.append(self._given.popleft())
-        if len(events) > 1 or given:
-            chunks.sort(key=lambda chunk: chunk.arrival_ns)
-        return chunks
+                parts += self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns)
+        if self._given:
+            parts.append([self._given.popleft() for _ in range(len(self._given))])
+        if len(parts) == 1:
+            return parts[0]
+        return sorted((chunk for part in parts for chunk in part), key=lambda chunk: chunk.arrival_ns)
 
-    def _drain(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
+    def _drain(self, udp: socket.socket, offset_ns: int | None) -> list[Sequence[Chunk]]:
         """Read what waits on one socket, by the batch where the system can."""
         if self._batches is None or not isinstance(udp, socket.socket):
-            self._drain_singly(udp, offset_ns, chunks)
-            return
+            return [self._drain_singly(udp, offset_ns)]
+        parts: list[Sequence[Chunk]] = []
         destination: tuple[str, int] = udp.getsockname()
         is_alone = udp.fileno() not in self._shared or len(self._shared[udp.fileno()].links) == 1
         for _ in range(0, DATAGRAMS_PER_READ, SLOTS):
@@ -267,22 +266,27 @@ class UdpLink:
                     continue
                 raise DeviceError(f"UDP port {destination[1]}: {_reason(error)}") from error
             if batch is None:
-                return
+                break
             now_ns = time.monotonic_ns()
             if batch.drops is not None:
                 self._count_kernel_drops(udp.fileno(), batch.drops)
             arrivals_ns = batch.stamp_ns - (offset_ns or 0)
             # A wall clock that was set in this very moment would show as the future or the far past.
             is_credible = (arrivals_ns > now_ns - 10_000_000_000) & (arrivals_ns <= now_ns) & (offset_ns is not None)
-            stamps_ns = np.where(is_credible, arrivals_ns, now_ns).tolist()
-            first = _source(batch.source[0])
-            if is_alone and len(set(batch.source)) == 1 and self.accepts(first):
-                chunks += map(Chunk, stamps_ns, batch.data, repeat(first), repeat(destination))
+            arrivals_ns = np.where(is_credible, arrivals_ns, now_ns)
+            is_of_one = is_alone and bool((batch.source == batch.source[0]).all())
+            first = _source(int(batch.source[0]))
+            if is_of_one and not isinstance(batch.data, list) and self.accepts(first):
+                parts.append(Datagrams(arrivals_ns, batch.data, first, destination))
             else:
-                for arrival_ns, data, number in zip(stamps_ns, batch.data, batch.source, strict=True):
+                rows = batch.data if isinstance(batch.data, list) else [row.tobytes() for row in batch.data]
+                chunks: list[Chunk] = []
+                for arrival_ns, data, number in zip(arrivals_ns.tolist(), rows, batch.source.tolist(), strict=True):
                     self._accept(udp, arrival_ns, data, _source(number), destination, chunks)
+                parts.append(chunks)
             if len(batch.data) < SLOTS:
-                return
+                break
+        return parts
 
     def _accept(
         self,
@@ -301,13 +305,14 @@ class UdpLink:
         else:
             self.foreign += 1
 
-    def _drain_singly(self, udp: socket.socket, offset_ns: int | None, chunks: list[Chunk]) -> None:
+    def _drain_singly(self, udp: socket.socket, offset_ns: int | None) -> list[Chunk]:
+        chunks: list[Chunk] = []
         destination = udp.getsockname()
         for _ in range(DATAGRAMS_PER_READ):
             try:
                 size, ancillary, _, source = udp.recvmsg_into([self._buffer], 128)
             except BlockingIOError:
-                return
+                break
             except OSError as error:
                 if error.errno == errno.ECONNREFUSED:  # a late answer to something sent, not about what comes
                     continue
@@ -323,6 +328,7 @@ class UdpLink:
                 elif kind == SO_RXQ_OVFL:
                     self._count_kernel_drops(udp.fileno(), _UINT32.unpack_from(payload)[0])
             self._accept(udp, arrival_ns, bytes(self._buffer[:size]), source, destination, chunks)
+        return chunks
 
     def _deal_out(self, udp: socket.socket, chunk: Chunk, chunks: list[Chunk]) -> None:
         """Give a datagram to all links that accept it; one that nobody accepts is foreign to the one that read it."""

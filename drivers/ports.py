@@ -1,5 +1,6 @@
 """What a driver sees of its links: the seam between drivers and the real world, or a capture played instead."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -48,7 +49,7 @@ class UdpPorts(Protocol):
     kernel_drops: int
     receive_buffer_bytes: int
 
-    def read(self, timeout_s: float) -> list[Chunk]:
+    def read(self, timeout_s: float) -> Sequence[Chunk]:
         """What has come on all ports, in order of arrival; empty after `timeout_s`. Raises DeviceError."""
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ One datagram is one object, times in microseconds of the sender's clock, z up, `
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from threading import Event
 from typing import Annotated
@@ -107,7 +107,7 @@ class PoseDriver:
         self._kernel_drops = self._foreign = 0
         self._last_foreign_ns = -FOREIGN_QUIET_NS
         deadline_ns = self.links.monotonic_ns() + int(FIRST_POSE_S * 1e9)
-        self._held: list[Chunk] = []
+        self._held: Sequence[Chunk] = []
         while not self._held and (left_ns := deadline_ns - self.links.monotonic_ns()) > 0:
             self._held = link.read(left_ns / 1e9)
         if not self._held:
@@ -122,7 +122,7 @@ class PoseDriver:
         """Yield poses as they come. Raises DeviceError after silence."""
         link = self._link
         assert link is not None
-        chunks, self._held = self._held, []
+        chunks, self._held = self._held, ()
         last_chunk_ns = self.links.monotonic_ns()
         while not stop.is_set():
             now_ns = self.links.monotonic_ns()
@@ -135,7 +135,7 @@ class PoseDriver:
                 raise DeviceError(f"{self._config.address}: no pose for {SILENCE_S:.0f} s")
             chunks = link.read(0.1)
 
-    def _take(self, link: UdpPorts, chunks: list[Chunk], now_ns: int) -> Received:
+    def _take(self, link: UdpPorts, chunks: Sequence[Chunk], now_ns: int) -> Received:
         samples: list[tuple[int, Sample]] = []
         events: list[DeviceEvent] = []
         for chunk in chunks:
@@ -143,7 +143,7 @@ class PoseDriver:
                 if self._is_new(pose, events):
                     samples.append((chunk.arrival_ns, pose))
         events += self._link_events(link, now_ns)
-        return Received(tuple(chunks), tuple(samples), (*events, *self._garbage.events(now_ns)))
+        return Received(chunks, tuple(samples), (*events, *self._garbage.events(now_ns)))
 
     def _is_new(self, pose: PoseSample, events: list[DeviceEvent]) -> bool:
         """False for a datagram that came twice. What is missing before the pose, or a restart, becomes an event."""

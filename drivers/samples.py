@@ -4,8 +4,9 @@ Times here are still the device's own (`device_ticks`, in the unit of the driver
 map turns them into host time. Quantities are SI, with the unit in the name.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -165,6 +166,33 @@ class Chunk:
     sent: bool = False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Datagrams(Sequence[Chunk]):
+    """Datagrams of one source that have one length, as they came: chunks for who wants them one by one.
+
+    arrival_ns: (n,) int64. data: (n, bytes) uint8, C-contiguous.
+    """
+
+    arrival_ns: npt.NDArray[np.int64]
+    data: npt.NDArray[np.uint8]
+    source: tuple[str, int]
+    destination: tuple[str, int]
+
+    def __len__(self) -> int:
+        """Number of datagrams."""
+        return len(self.arrival_ns)
+
+    @overload
+    def __getitem__(self, index: int) -> Chunk: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Chunk]: ...
+    def __getitem__(self, index: int | slice) -> Chunk | list[Chunk]:
+        """One of them, or a list."""
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        return Chunk(int(self.arrival_ns[index]), self.data[index].tobytes(), self.source, self.destination)
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
     """Something that happened to a device: what a user must know to trust (or not) the data around it.
@@ -184,6 +212,6 @@ class Received:
     Arrival times are nanoseconds of the host's monotonic clock.
     """
 
-    chunks: tuple[Chunk, ...] = ()
+    chunks: Sequence[Chunk] = ()
     samples: tuple[tuple[int, Sample], ...] = ()
     events: tuple[DeviceEvent, ...] = ()

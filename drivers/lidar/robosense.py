@@ -1,10 +1,10 @@
 """RoboSense lidars over UDP: measurement packets (MSOP) on one port, information packets (DIFOP) on another.
 
-Datagrams wait in the socket's buffer for a few milliseconds and are then taken together: one wake-up for some sixty
-of them, while each keeps the kernel's time of its arrival.
+Datagrams wait in the socket's buffer for some milliseconds and are then taken together: one wake-up for a hundred of
+them, while each keeps the kernel's time of its arrival.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from threading import Event
 from typing import Annotated
 
@@ -16,16 +16,16 @@ from drivers.lidar import fast
 from drivers.lidar.difop import destination, helios_lasers, is_difop
 from drivers.lidar.models import HELIOS, M1, MODELS, Model, ModelKey, SequencedModel, SpinningModel, recognise
 from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
-from drivers.lidar.slots import DUAL_RETURN
+from drivers.lidar.slots import DUAL_RETURN, NO_TICKS
 from drivers.lidar.watches import BadPacketWatch, LossWatch, SetupWatch
 from drivers.links import LIVE, SILENCE_S, Links, UdpOptions, UdpPorts
-from drivers.samples import POINT_DTYPE, Chunk, ClockPairs, DeviceEvent, Received, Sample, ScanSample
+from drivers.samples import POINT_DTYPE, Chunk, ClockPairs, Datagrams, DeviceEvent, Received, Sample, ScanSample
 
 FIRST_PACKET_S = 3.0
 DIFOP_PERIOD_S = 1.1
 """Most lidars tell of themselves once a second, an M1P ten times."""
 HELD_DATAGRAMS = 30_000
-COLLECT_S = 0.010
+COLLECT_S = 0.020
 """Datagrams are taken together after so long, or after a quarter of what the socket's buffer holds."""
 PAIRS_EVERY_NS = 50_000_000
 BATCH_DATAGRAMS = 512
@@ -98,8 +98,7 @@ class RobosenseDriver:
         )
         self._decoder = RobosenseDecoder()
         self._held: list[Chunk] = []
-        self._ticks: list[int] = []
-        self._ticks_arrivals_ns: list[int] = []
+        self._unsent_pairs: list[ClockPairs] = []
 
     @property
     def identity(self) -> dict[str, str]:
@@ -115,7 +114,7 @@ class RobosenseDriver:
         """Open the ports and wait for the first measurement packet. Raises DeviceError with what to check."""
         self.close()
         self._link = link = self._open()
-        self._held, self._ticks, self._ticks_arrivals_ns = [], [], []
+        self._held, self._unsent_pairs = [], []
         try:
             model, difop, self._connect_events = self._meet(link)
         except DeviceError:
@@ -244,32 +243,45 @@ class RobosenseDriver:
         for first in range(0, len(chunks), BATCH_DATAGRAMS):
             yield self._take(chunks[first : first + BATCH_DATAGRAMS], self.links.monotonic_ns())
 
-    def _take(self, chunks: list[Chunk], now_ns: int) -> Received:
+    def _take(self, chunks: Sequence[Chunk], now_ns: int) -> Received:
         """Decode a batch: first its clock pairs, so that its frames can be placed in time."""
-        scans: list[tuple[int, ScanSample]] = []
-        decoder, ticks, arrivals_ns = self._decoder, self._ticks, self._ticks_arrivals_ns
-        for chunk in chunks:
-            for scan in decoder.feed(chunk.data):
-                scans.append((chunk.arrival_ns, scan))
-            if decoder.last_ticks is not None:
-                ticks.append(decoder.last_ticks)
-                arrivals_ns.append(chunk.arrival_ns)
+        scans, pairs = self._decode(chunks)
         samples: list[tuple[int, Sample]] = []
-        if arrivals_ns:
-            self._last_arrival_ns = arrivals_ns[-1]
-            if scans or now_ns - arrivals_ns[0] >= PAIRS_EVERY_NS:
+        if pairs.ticks.size:
+            self._unsent_pairs.append(pairs)
+        if self._unsent_pairs:
+            self._last_arrival_ns = int(self._unsent_pairs[-1].arrival_ns[-1])
+            if scans or now_ns - int(self._unsent_pairs[0].arrival_ns[0]) >= PAIRS_EVERY_NS:
                 samples += self._pairs()
         samples += scans
         events = self._losses.events(now_ns) + self._bad_packets.events(now_ns) + self._setup_changes.events()
-        return Received(tuple(chunks), tuple(samples), events)
+        return Received(chunks, tuple(samples), events)
+
+    def _decode(self, chunks: Sequence[Chunk]) -> tuple[list[tuple[int, ScanSample]], ClockPairs]:
+        """Frames with the arrival of the packet that closed them, and the clock pairs of all measurement packets."""
+        decoder = self._decoder
+        if isinstance(chunks, Datagrams):
+            found, ticks = decoder.feed_many(chunks.data)
+            arrivals_ns = chunks.arrival_ns
+            scans = [(int(arrivals_ns[number]), scan) for number, scan in found]
+        else:
+            scans, known = [], []
+            for chunk in chunks:
+                scans += [(chunk.arrival_ns, scan) for scan in decoder.feed(chunk.data)]
+                known.append(NO_TICKS if decoder.last_ticks is None else decoder.last_ticks)
+            ticks = np.array(known, np.int64)
+            arrivals_ns = np.array([chunk.arrival_ns for chunk in chunks], np.int64)
+        is_known = ticks != NO_TICKS
+        return scans, ClockPairs(ticks[is_known], arrivals_ns[is_known])
 
     def _pairs(self) -> list[tuple[int, ClockPairs]]:
         """The clock pairs since the last ones."""
-        ticks, arrivals_ns = self._ticks, self._ticks_arrivals_ns
-        if not ticks:
+        pairs, self._unsent_pairs = self._unsent_pairs, []
+        if not pairs:
             return []
-        self._ticks, self._ticks_arrivals_ns = [], []
-        return [(arrivals_ns[0], ClockPairs(np.array(ticks, np.int64), np.array(arrivals_ns, np.int64)))]
+        ticks = np.concatenate([part.ticks for part in pairs])
+        arrivals_ns = np.concatenate([part.arrival_ns for part in pairs])
+        return [(int(arrivals_ns[0]), ClockPairs(ticks, arrivals_ns))]
 
     def close(self) -> None:
         """Release the ports."""

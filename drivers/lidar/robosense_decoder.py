@@ -12,6 +12,9 @@ import zlib
 from collections import deque
 from dataclasses import dataclass, replace
 
+import numpy as np
+import numpy.typing as npt
+
 from drivers.lidar.difop import MAGIC as DIFOP_MAGIC
 from drivers.lidar.difop import LidarFacts, helios_lasers, is_difop, read_difop
 from drivers.lidar.imu import AIRY_MAGIC, is_airy_imu
@@ -28,7 +31,7 @@ from drivers.lidar.models import (
     recognise,
 )
 from drivers.lidar.points import PointDecoder
-from drivers.lidar.slots import HEADER, SECONDS_LIMIT, Counters, SlotFrames
+from drivers.lidar.slots import HEADER, NO_TICKS, SECONDS_LIMIT, Counters, SlotFrames
 from drivers.lidar.spinning_points import TURN, Setup, SpinningPointDecoder, spinning_packet_ticks
 from drivers.lidar.turns import TurnFrames
 from drivers.samples import ScanSample
@@ -121,6 +124,32 @@ class RobosenseDecoder(Counters):
             return self._feed_spinning(found, datagram)
         return self._feed_slots(self._begin_slots(found), datagram)
 
+    def feed_many(self, datagrams: npt.NDArray[np.uint8]) -> tuple[list[tuple[int, ScanSample]], npt.NDArray[np.int64]]:
+        """`feed` for (n, bytes) datagrams: the frames they close with the index of the datagram that did, and ticks.
+
+        ticks: (n,) time of each in us, NO_TICKS where it is no measurement packet.
+        """
+        slots, packets = self._slots, self._without_layers(datagrams)
+        if slots is not None and packets.shape[1] == self._slot_bytes and len(packets):
+            packets = np.ascontiguousarray(packets)
+            magic = np.ndarray(len(packets), "S4", packets, 0, packets.strides[:1])
+            if (magic == SEQUENCED_MAGIC).all() and self._all_crc_fit(packets):
+                scans, ticks = slots.feed_many(packets)
+                self.last_ticks, self._last_packet = slots.last_ticks, packets[-1].tobytes()
+                return scans, ticks
+        scans, ticks = [], np.empty(len(datagrams), np.int64)
+        for number, datagram in enumerate(datagrams):
+            scans += [(number, scan) for scan in self.feed(datagram.tobytes())]
+            ticks[number] = NO_TICKS if self.last_ticks is None else self.last_ticks
+        return scans, ticks
+
+    def _without_layers(self, datagrams: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        options = self.options
+        return datagrams[:, options.user_layer_bytes : max(0, datagrams.shape[1] - options.tail_layer_bytes)]
+
+    def _all_crc_fit(self, packets: npt.NDArray[np.uint8]) -> bool:
+        return not self._crc_at or all(self._crc_fits(packet.data, self._crc_at) for packet in packets)
+
     def finish(self) -> list[ScanSample]:
         """Write what is held: the stream has ended."""
         for datagram in self._waiting:
@@ -166,7 +195,7 @@ class RobosenseDecoder(Counters):
         self.last_ticks, self._last_packet = slots.last_ticks, datagram
         return scans
 
-    def _crc_fits(self, datagram: bytes, at: int) -> bool:
+    def _crc_fits(self, datagram: bytes | memoryview, at: int) -> bool:
         """Whether the checksum fits. Not every firmware writes one: it counts from the first that fitted on."""
         written = int.from_bytes(datagram[at : at + 4])
         if not self._crc_is_used and written == 0:

@@ -8,7 +8,7 @@
 listened to by both devices.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from threading import Event
 from typing import Annotated, Literal
 
@@ -70,7 +70,7 @@ class RobosenseImuDriver:
         self._decoder = ImuDecoder(config.model)
         self._garbage = GarbageWatch(self._decoder)
         self._lost = 0
-        self._held: list[Chunk] = []
+        self._held: Sequence[Chunk] = []
         deadline_ns = self.links.monotonic_ns() + int(FIRST_PACKET_S * 1e9)
         probe = ImuDecoder(config.model)
         while not any(probe.feed(chunk.data) for chunk in self._held):
@@ -101,7 +101,7 @@ class RobosenseImuDriver:
                 raise DeviceError(f"{self._config.address}: no IMU reading for {SILENCE_S:.0f} s")
             chunks = link.read(0.1)
 
-    def _take(self, chunks: list[Chunk], now_ns: int) -> Received:
+    def _take(self, chunks: Sequence[Chunk], now_ns: int) -> Received:
         samples: list[tuple[int, Sample]] = []
         for chunk in chunks:
             samples += [(chunk.arrival_ns, sample) for sample in self._decoder.feed(chunk.data)]
@@ -109,7 +109,7 @@ class RobosenseImuDriver:
         if lost := self._decoder.lost - self._lost:
             self._lost += lost
             events += (DeviceEvent("gap", f"{lost} IMU packets missing", lost),)
-        return Received(tuple(chunks), tuple(samples), events)
+        return Received(chunks, tuple(samples), events)
 
     def close(self) -> None:
         """Release the port."""

@@ -31,6 +31,15 @@ from drivers.samples import ScanSample
 
 HEADER = struct.Struct(">4xH2xBxHII")
 """Sequence number, return mode, seconds (upper 16 bit, lower 32 bit), microseconds."""
+HEADS = np.dtype(
+    {
+        "names": ["sequence", "upper", "lower", "microseconds"],
+        "formats": [">u2", ">u2", ">u4", ">u4"],
+        "offsets": [4, 10, 12, 16],
+        "itemsize": 20,
+    }
+)
+"""The same of many."""
 DUAL_RETURN = 0
 SECONDS_LIMIT = 1 << 33
 """A packet time beyond (year 2242) is not one; below, microseconds are exact in int64 and float64."""
@@ -39,9 +48,13 @@ REORDER_PACKETS = 20
 """A frame with holes is closed when this many packets of the next one have come."""
 FRAMES_REMEMBERED = 10
 LONGEST_OUTAGE_FRAMES = 600
+SINGLY = 8
+"""So many packets of a batch are placed one by one before it is tried again with all that are left."""
+NO_TICKS = -1
 
 DecodePackets: TypeAlias = Callable[[npt.NDArray[np.uint8]], npt.NDArray[np.void]]
 Refuse: TypeAlias = Callable[[bytes, str], None]
+Ints: TypeAlias = npt.NDArray[np.int64]
 
 
 class Counters:
@@ -78,13 +91,15 @@ class _Frame:
 
     opener: the packet that opened it, from which the others are measured. follows: something came before it.
     whole: number of packets with which it is complete, 0 where that is not certain.
+    memory: (slots, packet_bytes), None once the frame was written. is_here: 1 for each slot that was filled.
     """
 
     opener: _Packet
     cadence: _Cadence
     follows: bool
     whole: int
-    slots: list[bytes | None]
+    memory: npt.NDArray[np.uint8] | None
+    is_here: bytearray
     spacing_us: float = 0.0
     received: int = 0
     duplicates: int = 0
@@ -107,14 +122,33 @@ class _Frame:
 
     def add(self, packet: _Packet) -> bool:
         """Put the packet into its slot; False when that is taken."""
-        if self.slots[packet.sequence] is not None:
+        if self.is_here[packet.sequence]:
             return False
-        self.slots[packet.sequence] = packet.datagram
-        self.received += 1
+        self.put(packet.sequence, packet.datagram)
         steps = packet.sequence - self.opener.sequence
         if steps > 0 and packet.ticks > self.opener.ticks:
             self.spacing_us = (packet.ticks - self.opener.ticks) / steps
         return True
+
+    def put(self, sequence: int, datagram: bytes) -> None:
+        """Fill an empty slot."""
+        self.is_here[sequence] = 1
+        self.received += 1
+        if self.memory is not None:
+            self.memory[sequence] = np.frombuffer(datagram, np.uint8)
+
+    def put_many(self, sequence: Ints, datagrams: npt.NDArray[np.uint8]) -> None:
+        """Fill empty slots, in ascending order."""
+        assert self.memory is not None
+        first, last = int(sequence[0]), int(sequence[-1])
+        is_here = np.frombuffer(self.is_here, np.uint8)
+        if last - first + 1 == len(sequence):
+            is_here[first : last + 1] = 1
+            self.memory[first : last + 1] = datagrams
+        else:
+            is_here[sequence] = 1
+            self.memory[sequence] = datagrams
+        self.received += len(sequence)
 
 
 class SlotFrames:
@@ -141,6 +175,7 @@ class SlotFrames:
         self._older: _Frame | None = None
         self._newest: _Frame | None = None
         self._stray: _Packet | None = None
+        self._spare: list[npt.NDArray[np.uint8]] = []  # memory of frames that were written
 
     def feed(self, datagram: bytes) -> list[ScanSample]:
         """Take one packet; gives the frames it closes. `last_ticks` is then its time, None when it is bad."""
@@ -160,12 +195,58 @@ class SlotFrames:
             spacing_us = frame.cadence.spacing_us
             opener = frame.opener
             off_us = ticks - opener.ticks - (sequence - opener.sequence) * spacing_us
-            is_here = spacing_us > 0 and -self._near_us < off_us < self._near_us
-            if is_here and frame.slots[sequence] is None and not frame.is_emitted:
-                frame.slots[sequence] = datagram
-                frame.received += 1
+            is_in_time = spacing_us > 0 and -self._near_us < off_us < self._near_us
+            if is_in_time and not frame.is_here[sequence] and not frame.is_emitted:
+                frame.put(sequence, datagram)
                 return self._emit(frame) if frame.received == frame.whole else []
         return self._place(_Packet(sequence, ticks, mode == DUAL_RETURN, datagram))
+
+    def feed_many(self, datagrams: npt.NDArray[np.uint8]) -> tuple[list[tuple[int, ScanSample]], Ints]:
+        """`feed` for (n, packet_bytes): the frames they close with the index of the packet that did, and ticks.
+
+        ticks: (n,), NO_TICKS for a packet that is bad.
+        """
+        heads = np.ndarray(len(datagrams), HEADS, datagrams, 0, datagrams.strides[:1])
+        sequence = heads["sequence"].astype(np.int64)
+        seconds = heads["upper"].astype(np.int64) << 32 | heads["lower"]
+        ticks = seconds * 1_000_000 + heads["microseconds"]
+        ticks[(seconds >= SECONDS_LIMIT) | (sequence < 1) | (sequence > self._largest_sequence)] = NO_TICKS
+        scans: list[tuple[int, ScanSample]] = []
+        start = 0
+        while start < len(datagrams):
+            run = self._take_run(sequence[start:], ticks[start:], datagrams[start:])
+            if run:
+                start += run
+                frame = self._newest
+                if frame is not None and frame.received == frame.whole:
+                    scans += [(start - 1, scan) for scan in self._emit(frame)]
+            else:  # something out of the ordinary: the beginning of a frame, for one
+                for _ in range(min(SINGLY, len(datagrams) - start)):
+                    scans += [(start, scan) for scan in self.feed(datagrams[start].tobytes())]
+                    start += 1
+        self.last_ticks = int(ticks[-1]) if ticks[-1] != NO_TICKS else None
+        return scans, ticks
+
+    def _take_run(self, sequence: Ints, ticks: Ints, datagrams: npt.NDArray[np.uint8]) -> int:
+        """Take the first packets as long as they are plainly of the newest frame and in order; how many these are."""
+        frame = self._newest
+        if frame is None or frame.is_emitted or self._stray is not None:
+            return 0
+        spacing_us, opener = frame.cadence.spacing_us, frame.opener
+        if not spacing_us or not (self._older is None or self._older.is_emitted):
+            return 0
+        off_us = ticks - opener.ticks - (sequence - opener.sequence) * spacing_us
+        is_plain = (off_us > -self._near_us) & (off_us < self._near_us) & (ticks != NO_TICKS)
+        is_plain[1:] &= sequence[1:] > sequence[:-1]
+        run = len(is_plain) if is_plain.all() else int(is_plain.argmin())
+        if run:
+            is_taken = np.frombuffer(frame.is_here, np.uint8)[sequence[:run]]
+            run = int(is_taken.argmax()) if is_taken.any() else run
+        if frame.whole:
+            run = min(run, frame.whole - frame.received)
+        if run > 0:
+            frame.put_many(sequence[:run], datagrams[:run])
+        return max(run, 0)
 
     def finish(self) -> list[ScanSample]:
         """Write what is held: the stream has ended."""
@@ -231,7 +312,9 @@ class SlotFrames:
 
     def _open(self, packet: _Packet, follows: bool) -> _Frame:
         cadence = self._cadences[packet.is_dual]
-        frame = _Frame(packet, cadence, follows, 0, [None] * (self._largest_sequence + 1))
+        slots, size = self._largest_sequence + 1, self.model.packet_bytes
+        memory = self._spare.pop() if self._spare else np.empty((slots, size), np.uint8)
+        frame = _Frame(packet, cadence, follows, 0, memory, bytearray(slots))
         frame.whole = self._packets_when_whole(frame)
         return frame
 
@@ -262,9 +345,11 @@ class SlotFrames:
         if frame is None or frame.is_emitted:
             return []
         frame.is_emitted = True
-        present = [packet for packet in frame.slots if packet is not None]
-        lowest, largest = (HEADER.unpack_from(end)[0] for end in (present[0], present[-1]))
-        packets = np.frombuffer(b"".join(present), np.uint8).reshape(len(present), -1)
+        present = np.flatnonzero(np.frombuffer(frame.is_here, np.uint8))
+        lowest, largest = int(present[0]), int(present[-1])
+        memory, frame.memory = frame.memory, None
+        assert memory is not None
+        packets = memory[lowest : largest + 1] if largest - lowest < len(present) else memory[present]
         ticks = packet_microseconds(packets)
         if largest >= lowest + 8:  # over so many steps, rounding and jitter of the times do not matter
             frame.cadence.spacing_us = max(float(ticks[-1] - ticks[0]) / (largest - lowest), 0.0)
@@ -272,9 +357,11 @@ class SlotFrames:
         expected = max(self._frame_packets(frame), largest)
         before_start = 0 if frame.follows else lowest - 1
         self._counters.lost_packets += (expected if is_followed else largest) - before_start - frame.received
+        points = self._decode(packets)
+        self._spare.append(memory)
         return [
             ScanSample(
-                points=self._decode(packets),
+                points=points,
                 first_ticks=int(ticks.min()),
                 last_ticks=int(ticks.max()),
                 packets_expected=expected,

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recorder.recording.manifest import FileEntry, sync_folder
-from recorder.recording.work import ByteQueue, Ticket, start_thread
+from recorder.recording.work import ByteQueue, Ticket, forget_cached, start_thread
 
 FOLDER = "lidar"
 QUEUE_BYTES = 128 << 20
@@ -61,10 +61,12 @@ class ScanWriter:
 
     def _write(self, path: Path, points: npt.NDArray[np.void]) -> None:
         temporary = path.with_suffix(".tmp")
-        with temporary.open("xb") as file:
-            file.write(points.data)
-            file.flush()
+        with temporary.open("xb", buffering=0) as file:
+            rest = points.view(np.uint8).data
+            while rest:
+                rest = rest[file.write(rest) :]
             os.fdatasync(file.fileno())
+            forget_cached(file.fileno())
         temporary.rename(path)
 
     def _failed(self, name: str, error: Exception) -> None:

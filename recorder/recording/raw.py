@@ -21,13 +21,13 @@ raw/DEVICE.refined holds one int64 for each row of DEVICE.clock: its time after 
 
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.samples import Chunk
+from drivers.samples import Chunk, Datagrams
 from recorder.recording.manifest import FileEntry
 from recorder.recording.work import ByteQueue, HashedFile, start_thread
 
@@ -66,6 +66,23 @@ class TapeFile:
                 self._write_packet(chunk, b"", chunk.data[start : start + MAX_SERIAL_PACKET])
         else:
             self._write_packet(chunk, self._ip_header(chunk), chunk.data)
+
+    def write_many(self, datagrams: Datagrams) -> None:
+        """Append datagrams of one length as enhanced packet blocks."""
+        count, size = datagrams.data.shape
+        header = self._ip_header(datagrams[0])
+        captured = len(header) + size
+        length = _BLOCK_HEAD.size + captured + -captured % 4 + 4
+        payload_at = _BLOCK_HEAD.size + len(header)
+        stamp_ns = datagrams.arrival_ns + self._offset_ns
+        blocks = np.zeros((count, length), np.uint8)
+        head = _BLOCK_HEAD.pack(6, length, 0, 0, 0, captured, captured) + header
+        blocks[:, :payload_at] = np.frombuffer(head, np.uint8)
+        np.ndarray(count, "<u4", blocks, 12, (length,))[:] = stamp_ns >> 32
+        np.ndarray(count, "<u4", blocks, 16, (length,))[:] = stamp_ns & 0xFFFFFFFF
+        blocks[:, payload_at : payload_at + size] = datagrams.data
+        np.ndarray(count, "<u4", blocks, length - 4, (length,))[:] = length
+        self.file.write(blocks.reshape(-1).data)
 
     def _write_packet(self, chunk: Chunk, header: bytes, payload: bytes) -> None:
         stamp_ns = chunk.arrival_ns + self._offset_ns
@@ -150,15 +167,15 @@ class RawWriter:
         self._tape = tape
         self._tapes: dict[str, TapeFile] = {}
         self._pair_files: dict[str, HashedFile] = {}
-        self._queue: ByteQueue[tuple[str, tuple[Chunk, ...] | bytes]] = ByteQueue(QUEUE_BYTES)
+        self._queue: ByteQueue[tuple[str, Sequence[Chunk] | bytes]] = ByteQueue(QUEUE_BYTES)
         self._on_error = on_error
         self._thread = start_thread("raw", self._run, self._failed)
 
-    def put_chunks(self, device: str, chunks: tuple[Chunk, ...]) -> None:
+    def put_chunks(self, device: str, chunks: Sequence[Chunk]) -> None:
         """Take what one read brought; never waits."""
         if not self._tape or not chunks:
             return
-        size = sum(len(chunk.data) for chunk in chunks)
+        size = chunks.data.nbytes if isinstance(chunks, Datagrams) else sum(len(chunk.data) for chunk in chunks)
         if not self._queue.offer((device, chunks), size + 64 * len(chunks)):
             self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + size
 
@@ -176,13 +193,17 @@ class RawWriter:
                     self._pair_file(device).write(item)
                 else:
                     tape = self._tape_file(device, item[0])
-                    for chunk in item:
-                        tape.write(chunk)
+                    if isinstance(item, Datagrams):
+                        tape.write_many(item)
+                    else:
+                        for chunk in item:
+                            tape.write(chunk)
             for file in self._files().values():
                 file.flush()
             if time.monotonic() - last_sync_s >= SYNC_S:
                 for file in self._files().values():
                     file.sync()
+                    file.forget()
                 last_sync_s = time.monotonic()
             time.sleep(0.02)  # collects chunks: few large writes
 

@@ -4,6 +4,7 @@ A line of data.jsonl that names a picture or a file may be written only when tha
 picture or file says so through the line's ticket.
 """
 
+import contextlib
 import hashlib
 import os
 import threading
@@ -109,7 +110,7 @@ class HashedFile:
         self._hash = hashlib.sha256()
         self._size = 0
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes | memoryview) -> None:
         """Append bytes."""
         self._file.write(data)
         self._hash.update(data)
@@ -123,6 +124,10 @@ class HashedFile:
         """Make what was flushed survive power loss."""
         os.fdatasync(self._file.fileno())
 
+    def forget(self) -> None:
+        """Let go of the system's copy in memory of what was synced; see `forget_cached`."""
+        forget_cached(self._file.fileno())
+
     def close(self) -> FileEntry:
         """Close durably; gives size and hash."""
         try:
@@ -131,6 +136,17 @@ class HashedFile:
         finally:
             self._file.close()
         return FileEntry(self._size, self._hash.hexdigest())
+
+
+def forget_cached(descriptor: int) -> None:
+    """Let go of the system's copy in memory of what is on disk already.
+
+    A take of hours would fill the memory with files that nobody reads; and the memory of the last file, still in the
+    processor's cache, costs less to write to than some that was not used for long.
+    """
+    if hasattr(os, "posix_fadvise"):
+        with contextlib.suppress(OSError):  # only advice
+            os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def start_thread(name: str, body: Callable[[], None], on_error: Callable[[str, Exception], None]) -> threading.Thread:

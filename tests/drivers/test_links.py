@@ -351,7 +351,7 @@ def test_error_of_the_socket_is_a_device_error(udp: UdpLink) -> None:
             raise OSError(errno.ENETDOWN, "down")
 
     with pytest.raises(DeviceError, match="UDP port 6699: Network is down"):
-        udp._drain(Broken(), 0, [])  # type: ignore[arg-type]
+        udp._drain(Broken(), 0)  # type: ignore[arg-type]
 
 
 def test_port_in_use_is_named(udp: UdpLink) -> None:
