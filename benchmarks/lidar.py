@@ -4,14 +4,18 @@ Prints JSON lines, one for each measurement:
 
     decode    million points per second of one thread, of an M1's frames (a smooth scene, and random numbers), and of
               copying the resulting bytes in the same run: the ratio can be compared between machines
-    record    CPU seconds per second of one M1, from the socket to the files of a recording, raw tape included
+    record    CPU seconds per second of one M1, from the socket to the files of a recording, with the raw tape (the
+              default) and without, by the compiled loop and by numpy
     multiple  the largest multiple of an M1's rate, of those tried, that is received, decoded and written without a loss
+              (`--encoders 2`: beside two encoders of 1280x800 at 30 pictures a second)
 
-The sender is a process of its own, whose CPU time does not count.
+Only some: `python benchmarks/lidar.py multiple --multiples 20 --encoders 2`. The senders and encoders are processes of
+their own, whose CPU time does not count.
 """
 
 import argparse
 import contextlib
+import io
 import json
 import lzma
 import shutil
@@ -24,6 +28,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import av
 import msgspec
 import numpy as np
 
@@ -44,6 +49,7 @@ START_US = 1_700_000_000_000_000
 BURST_PACKETS = 42
 UDP_SEGMENT = 103
 LIDAR = "127.0.0.1"
+WIDTH, HEIGHT, FPS = 1280, 800, 30
 
 
 def scene() -> tuple[bytes, np.ndarray]:
@@ -119,19 +125,8 @@ def send(msop_port: int, difop_port: int, multiple: float, duration_s: float) ->
                 burst = data[first * M1.packet_bytes : (first + BURST_PACKETS) * M1.packet_bytes]
                 udp.sendto(burst, (LIDAR, msop_port))
                 sent += BURST_PACKETS
-    print(json.dumps({"sent": sent, "seconds": time.monotonic() - begin_s}))
-
-
-@contextlib.contextmanager
-def sender(ports: tuple[int, int], multiple: float, duration_s: float) -> Iterator[subprocess.Popen[str]]:
-    arguments = ["--send", *map(str, ports), str(multiple), str(duration_s)]
-    with subprocess.Popen([sys.executable, __file__, *arguments], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        try:
-            yield process
-        finally:
-            process.terminate()
+    seconds = time.monotonic() - begin_s
+    print(json.dumps({"sent": sent, "seconds": seconds, "cores": time.process_time() / seconds}))
 
 
 def free_ports() -> tuple[int, int]:
@@ -141,18 +136,61 @@ def free_ports() -> tuple[int, int]:
         return one.getsockname()[1], two.getsockname()[1]
 
 
-def record_one(folder: Path, duration_s: float) -> None:
+def encode(duration_s: float) -> None:
+    """An encoder: pictures of a moving texture at their rate; how many came in time as the last line."""
+    random = np.random.default_rng(1)
+    coarse = np.kron(random.integers(0, 248, (HEIGHT // 16 + 20, WIDTH // 16 + 20)), np.ones((16, 16)))
+    texture = (coarse + random.integers(0, 8, coarse.shape)).astype(np.uint8)
+    picture = np.full((HEIGHT * 3 // 2, WIDTH), 128, np.uint8)
+    late = 0
+    with av.open(io.BytesIO(), "w", format="matroska") as output:
+        stream = output.add_stream("libx264", rate=FPS, options={"preset": "ultrafast", "tune": "zerolatency"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        print("ready", flush=True)
+        begin_s = time.monotonic()
+        for number in range(round(duration_s * FPS)):
+            wait_s = begin_s + number / FPS - time.monotonic()
+            if wait_s > 0:
+                time.sleep(wait_s)
+            late += wait_s < -1.0 / FPS
+            shift = number % 160
+            picture[:HEIGHT] = texture[shift : shift + HEIGHT, shift : shift + WIDTH]
+            frame = av.VideoFrame.from_ndarray(picture, format="yuv420p")
+            frame.pts = number
+            stream.encode(frame)
+    seconds = time.monotonic() - begin_s
+    print(
+        json.dumps({"pictures": number + 1, "late": late, "seconds": seconds, "cores": time.process_time() / seconds})
+    )
+
+
+@contextlib.contextmanager
+def helper(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """This program as a process of its own, once it is ready."""
+    command = [sys.executable, __file__, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def record_one(folder: Path, duration_s: float, *, compiled: bool, raw: bool) -> None:
     """A whole take of one M1 in real time."""
+    fast.IS_AVAILABLE = compiled
     fast.warm_up(M1)
     ports = free_ports()
-    text = f"devices: {{lidar: {{driver: robosense, address: {LIDAR}, msop_port: {ports[0]}, difop_port: {ports[1]}}}}}"
+    lidar = f"{{driver: robosense, address: {LIDAR}, msop_port: {ports[0]}, difop_port: {ports[1]}}}"
+    text = f"{{raw: {str(raw).lower()}, devices: {{lidar: {lidar}}}}}"
     rig = parse_rig(text, "benchmark", folder)
     begun: list[tuple[float, float]] = []
 
     def on_status(_: object) -> None:
         begun.append((time.monotonic(), time.process_time()))
 
-    with sender(ports, 1.0, duration_s + 10):
+    with helper("--send", *ports, 1.0, duration_s + 10):
         _, manifest = record(
             rig, folder, name="take", duration_s=duration_s, stop=threading.Event(), on_status=on_status,
             on_event=lambda *_: None,
@@ -162,6 +200,8 @@ def record_one(folder: Path, duration_s: float) -> None:
     stream = manifest.devices["lidar"].stream
     print_line(
         measure="record",
+        path="numba" if compiled else "numpy",
+        raw_tape=raw,
         cpu_s_per_s=(end[1] - first[1]) / (end[0] - first[0]),
         scans=stream.written,
         lost=stream.lost + stream.dropped,
@@ -169,8 +209,9 @@ def record_one(folder: Path, duration_s: float) -> None:
     )
 
 
-def try_multiple(folder: Path, multiple: float, duration_s: float, write: str) -> bool:
+def try_multiple(folder: Path, multiple: float, duration_s: float, write: str, encoders: int) -> bool:
     """Receive and decode so many times an M1's rate, and write scans and tape or not; whether nothing was lost."""
+    fast.warm_up(M1)
     ports = free_ports()
     entry = {"driver": "robosense", "address": LIDAR, "msop_port": ports[0], "difop_port": ports[1]}
     driver = DRIVER.create("lidar", msgspec.convert(entry, RobosenseConfig))
@@ -179,7 +220,9 @@ def try_multiple(folder: Path, multiple: float, duration_s: float, write: str) -
     scans = ScanWriter(folder, lambda name, error: faults.append(f"{name}: {error}"))
     stop = threading.Event()
     points = packets = lost = 0
-    with sender(ports, multiple, duration_s) as process:
+    with contextlib.ExitStack() as stack:
+        encoding = [stack.enter_context(helper("--encode", duration_s + 4.0)) for _ in range(encoders)]
+        process = stack.enter_context(helper("--send", *ports, multiple, duration_s))
         driver.connect()
         begin = (time.monotonic(), time.process_time())
         threading.Timer(duration_s + 2.0, stop.set).start()
@@ -195,6 +238,7 @@ def try_multiple(folder: Path, multiple: float, duration_s: float, write: str) -
                         scans.put(sample.points)
         driver.close()
         sent = json.loads(process.communicate()[0])
+        pictures = [json.loads(encoder.communicate()[0]) for encoder in encoding]
     cpu_s = time.process_time() - begin[1]
     scans.close()
     raw.close()
@@ -211,6 +255,8 @@ def try_multiple(folder: Path, multiple: float, duration_s: float, write: str) -
         tape_lost_bytes=tape_lost,
         cores=cpu_s / sent["seconds"],
         points=points,
+        encoders=pictures,
+        sender_cores=sent["cores"],
         whole=is_whole,
     )
     return is_whole
@@ -223,31 +269,48 @@ def print_line(**values: object) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("measures", nargs="*", metavar="MEASURE", help="decode, record, multiple (default: all)")
     parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
     parser.add_argument("--folder", type=Path, help="where to write (default: a temporary folder)")
-    parser.add_argument("--multiples", type=float, nargs="*", help="multiples of an M1's rate to try")
+    parser.add_argument("--multiples", type=float, nargs="+", help="of an M1's rate, to try (default: 5 to 40)")
     parser.add_argument("--write", choices=["none", "scans", "all"], default="all", help="scans, or the raw tape too")
+    parser.add_argument("--encoders", type=int, default=0, help="so many encoders work beside")
     parser.add_argument("--seconds", type=float, help="how long each (default 20)")
-    parser.add_argument("--send", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--send", nargs=4, type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--encode", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.send:
-        send(int(arguments.send[0]), int(arguments.send[1]), float(arguments.send[2]), float(arguments.send[3]))
+        send(int(arguments.send[0]), int(arguments.send[1]), *arguments.send[2:])
         return
+    if arguments.encode:
+        encode(arguments.encode)
+        return
+    measures = arguments.measures or ["decode", "record", "multiple"]
     seconds = arguments.seconds or (1.0 if arguments.smoke else 20.0)
-    decode(3 if arguments.smoke else 100)
-    multiples = arguments.multiples or ([2.0] if arguments.smoke else [5.0, 10.0, 20.0, 30.0, 40.0])
+    has_numba = fast.IS_AVAILABLE
+    if "decode" in measures:
+        decode(3 if arguments.smoke else 100)
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
         folder = Path(name)
-        record_one(folder, 2.0 if arguments.smoke else seconds)
-        largest = 0.0
-        for multiple in multiples:
-            part = folder / str(multiple)
-            part.mkdir()
-            if not try_multiple(part, multiple, seconds, arguments.write):
-                break
-            largest = multiple
-            shutil.rmtree(part)
-    print_line(measure="largest multiple without loss", multiple=largest, seconds=seconds)
+        if "record" in measures:
+            for compiled in (True, False) if has_numba else (False,):
+                for raw in (True, False):
+                    part = folder / f"{compiled}{raw}"
+                    part.mkdir()
+                    record_one(part, 2.0 if arguments.smoke else seconds, compiled=compiled, raw=raw)
+                    shutil.rmtree(part)
+            fast.IS_AVAILABLE = has_numba
+        if "multiple" in measures:
+            multiples = arguments.multiples or ([2.0] if arguments.smoke else [5.0, 10.0, 20.0, 30.0, 40.0])
+            largest = 0.0
+            for multiple in multiples:
+                part = folder / str(multiple)
+                part.mkdir()
+                if not try_multiple(part, multiple, seconds, arguments.write, arguments.encoders):
+                    break
+                largest = multiple
+                shutil.rmtree(part)
+            print_line(measure="largest multiple without loss", multiple=largest, seconds=seconds)
 
 
 if __name__ == "__main__":

@@ -70,7 +70,9 @@ class _ClockTable:
         sample = stamped.sample
         if isinstance(sample, ScanSample):
             if stamped.point_host_ns is not None and stamped.point_ticks is not None:
-                self.batches.append(scan_rows(stamped.point_ticks, stamped.point_host_ns - start_ns, time_ns))
+                rows = scan_rows(stamped.point_ticks, stamped.point_host_ns, time_ns + start_ns)
+                rows[:, 2] -= start_ns
+                self.batches.append(rows)
         elif not isinstance(sample, ClockPairs) and sample.device_ticks is not None:
             self.rows.append((sample.device_ticks, stamped.arrival_ns, time_ns))
 

@@ -171,10 +171,23 @@ class Timebase:
         host_ns = min(entry.clock.map.host_ns(device_ns), arrival_ns)
         point_host_ns = ticks = None
         if isinstance(sample, ScanSample) and len(sample.points):
-            ticks = np.rint(sample.points["timestamp"] * entry.tick_hz).astype(np.int64)
-            point_host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
-            point_host_ns -= max(int(point_host_ns.max()) - arrival_ns, 0)  # all of them: points never share a time
+            point_host_ns, ticks = _point_times(entry, sample.points["timestamp"], arrival_ns)
             host_ns = int(point_host_ns.max())
         host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
         entry.last_host_ns = host_ns
         return Stamped(entry.device, host_ns, device_ns, arrival_ns + entry.latency_ns, sample, point_host_ns, ticks)
+
+
+def _point_times(
+    entry: _DeviceStream, timestamp_s: npt.NDArray[np.float64], arrival_ns: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Host times and ticks of a scan's points; worked out once for points on end that share their time."""
+    device_s = np.ascontiguousarray(timestamp_s)
+    is_new = np.ones(len(device_s), np.bool_)
+    np.not_equal(device_s[1:], device_s[:-1], out=is_new[1:])
+    first = np.flatnonzero(is_new)
+    counts = np.diff(first, append=len(device_s))
+    ticks = np.rint(device_s[first] * entry.tick_hz).astype(np.int64)
+    host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
+    host_ns -= max(int(host_ns.max()) - arrival_ns, 0)  # all of them: else those that are late would share a time
+    return host_ns.repeat(counts), ticks.repeat(counts)

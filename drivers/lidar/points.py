@@ -77,9 +77,9 @@ class PointDecoder:
         model: SequencedModel,
         min_range_m: float | None = None,
         max_range_m: float | None = None,
-        compiled: bool = fast.IS_AVAILABLE,
+        compiled: bool | None = None,
     ) -> None:
-        """Limits are inclusive; None is the model's own. compiled: by the loop of numba, not by numpy."""
+        """Limits are inclusive; None is the model's own. compiled: by numba (None: if it is there), else numpy."""
         self.model = model
         limits_m = (
             model.min_range_m if min_range_m is None else min_range_m,
@@ -87,8 +87,8 @@ class PointDecoder:
         )
         self._range_m = range_table(model.resolution_m, limits_m, model.min_range_m)
         self._sine, self._cosine = _sine_cosine()
-        self._compiled = compiled
-        if not compiled:
+        self._compiled = fast.IS_AVAILABLE if compiled is None else compiled
+        if not self._compiled:
             self._allocate()
 
     def _allocate(self) -> None:

@@ -1,6 +1,6 @@
 """RoboSense lidars over UDP: measurement packets (MSOP) on one port, information packets (DIFOP) on another.
 
-Datagrams wait in the socket's buffer for some milliseconds and are then taken together: one wake-up for a hundred of
+Datagrams wait in the socket's buffer for some milliseconds and are then taken together: one wake-up for hundreds of
 them, while each keeps the kernel's time of its arrival.
 """
 
@@ -25,7 +25,7 @@ FIRST_PACKET_S = 3.0
 DIFOP_PERIOD_S = 1.1
 """Most lidars tell of themselves once a second, an M1P ten times."""
 HELD_DATAGRAMS = 30_000
-COLLECT_S = 0.020
+COLLECT_S = 0.040
 """Datagrams are taken together after so long, or after a quarter of what the socket's buffer holds."""
 PAIRS_EVERY_NS = 50_000_000
 BATCH_DATAGRAMS = 512

@@ -35,6 +35,7 @@ FOLDER = "raw"
 QUEUE_BYTES = 64 << 20
 FLUSH_S = 0.5
 SYNC_S = 1.0
+COLLECT_S = 0.1
 NONE = -(1 << 63)
 SCAN_ROWS = 64
 LINKTYPE_RAW_IP = 101
@@ -205,7 +206,7 @@ class RawWriter:
                     file.sync()
                     file.forget()
                 last_sync_s = time.monotonic()
-            time.sleep(0.02)  # collects chunks: few large writes
+            time.sleep(COLLECT_S)  # few large writes
 
     def _files(self) -> dict[str, HashedFile]:
         tapes = {f"{FOLDER}/{device}.pcapng": tape.file for device, tape in self._tapes.items()}

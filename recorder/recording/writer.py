@@ -145,9 +145,9 @@ class RecordingWriter:
         *,
         late: bool = False,
     ) -> None:
-        """A file of points, stamped in recording time, and its line."""
+        """A file of points and its line; the points are stamped in recording time where they lie."""
         assert self._scans is not None
-        points = scan.points.copy()
+        points = scan.points
         points["timestamp"] = point_time_ns / NS_PER_S
         name, ticket = self._scans.put(points)
         self._lines.put(PendingScan(ticket, lidar_line(time_ns, model, name, scan)), late=late)
