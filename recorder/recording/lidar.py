@@ -57,24 +57,30 @@ class ScanWriter:
 
     def _write(self, scans: list[tuple[str, npt.NDArray[np.void], Ticket]]) -> None:
         """Write files and wait for all of them: that the disk works on many at once is what makes it fast."""
+        fault: OSError | None = None
         with contextlib.ExitStack() as stack:
             files = []
             for name, points, _ in scans:
-                path = (self._folder / name).with_suffix(".tmp")
-                file = stack.enter_context(path.open("xb", buffering=0))
-                rest = points.view(np.uint8).data
-                while rest:
-                    rest = rest[file.write(rest) :]
+                try:
+                    file = stack.enter_context((self._folder / name).with_suffix(".tmp").open("xb", buffering=0))
+                    rest = points.view(np.uint8).data
+                    while rest:
+                        rest = rest[file.write(rest) :]
+                except OSError as error:
+                    fault = error  # those before it can still be kept
+                    break
                 forget_cached(file.fileno())  # the disk begins
                 files.append(file)
-            for (name, points, _), file in zip(scans, files, strict=True):
-                self._entries[name] = FileEntry(points.nbytes, hashlib.sha256(points.data).hexdigest())
+            for (name, points, ticket), file in zip(scans, files, strict=False):
+                entry = FileEntry(points.nbytes, hashlib.sha256(points.data).hexdigest())
                 os.fdatasync(file.fileno())
                 forget_cached(file.fileno())
-        for name, _, ticket in scans:
-            path = self._folder / name
-            path.with_suffix(".tmp").rename(path)
-            ticket.state = "done"
+                path = self._folder / name
+                path.with_suffix(".tmp").rename(path)
+                self._entries[name] = entry
+                ticket.state = "done"
+        if fault is not None:
+            raise fault
         self._unsynced += len(scans)
         if self._unsynced >= SYNC_SCANS:
             self._unsynced = 0
