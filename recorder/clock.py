@@ -16,22 +16,48 @@ thread than the rest.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_estimator import KEPT_SKEW_PPM, LATE_NS, PERSISTS_NS, Estimator, Ints, S
+from recorder.clock_estimator import KEPT_SKEW_PPM, LATE_NS, Estimator, Ints, S
 from recorder.clock_fit import PPM, SlopePrior
 from recorder.clock_refine import refine_epoch
 
 FAR = 1 << 61  # ticks and device times beyond this are garbage
-STEP_BACK_NS = 1 * S  # less is reordering
+STEP_BACK_NS = S // 5  # less is reordering
 SUSPECTS = 3  # this many consistent samples prove a restart
+PAUSE_NS = 1 * S  # of steady lateness after a gap of the same length: the device clock stood still
+LASTING_NS = 10 * S  # of steady lateness that came otherwise
+LATE_BIN_NS = S // 4
+RECONNECTED_NS = 50_000_000  # after a reconnection the clock has run on if a sample is this near to the line
 MIN_BATCH = 32  # smaller ones are not worth numpy
 TWO_WAY_KEPT = 64
 NEVER_NS = -(1 << 63)
+
+
+@dataclass(slots=True)
+class _Lateness:
+    """Samples that are late one after another: the least lateness in each quarter second since `since_ns`."""
+
+    since_ns: int
+    limit_ns: int
+    lows: list[float] = field(default_factory=list)
+    bin: int = 0
+
+    def stays(self, device_ns: int, rest: float, tolerance_ns: float) -> bool:
+        """Take in one sample; False if the lateness changes, so that it is no pause."""
+        at = (device_ns - self.since_ns) // LATE_BIN_NS
+        if not self.lows or at > self.bin:
+            if max(self.lows, default=rest) > min(self.lows, default=rest) + tolerance_ns:
+                return False
+            self.lows.append(rest)
+            self.bin = at
+        self.lows[-1] = min(self.lows[-1], rest)
+        return rest > max(self.lows) - tolerance_ns or tolerance_ns == 0.0
 
 
 class ClockStream:
@@ -58,7 +84,12 @@ class ClockStream:
         self._arrival_ns = 0
         self._stamp_ns = NEVER_NS
         self._suspects: list[tuple[int, int]] = []
-        self._late_since: tuple[int, float] | None = None
+        self._lateness: _Lateness | None = None
+        self._reconnected = False
+
+    def expect_restart(self) -> None:
+        """The device was connected anew: unless the next samples lie on the line, its clock has restarted."""
+        self._reconnected = True
 
     @property
     def tick_ns(self) -> float:
@@ -85,7 +116,7 @@ class ClockStream:
         x = device_ns - estimator.anchor_device
         y = arrival_ns - estimator.anchor_host - x
         rest = y - estimator.fit.offset - estimator.fit.slope * x
-        if not -estimator.early_ns < rest < self._late_ns or self._suspects or self._late_since:
+        if not -estimator.early_ns < rest < self._late_ns or self._irregular:
             return self._observe_unsure(int(ticks), int(arrival_ns))
         if self._modulus and unwrapped // self._modulus != self._ticks // self._modulus:
             estimator.counts.wraps += 1
@@ -105,7 +136,7 @@ class ClockStream:
     def _observe_plain(self, ticks: Ints, arrival_ns: Ints) -> Ints | None:
         """The whole batch at once if nothing in it is out of the ordinary."""
         estimator = self._estimator
-        if self._suspects or self._late_since or int(np.abs(ticks).max()) > FAR // self._num:
+        if self._irregular or int(np.abs(ticks).max()) > FAR // self._num:
             return None
         step = np.diff(ticks, prepend=self._ticks % self._modulus if self._modulus else self._ticks)
         if self._modulus:
@@ -147,6 +178,10 @@ class ClockStream:
         """The last sample's ticks were impossible, unless the next ones prove a restart."""
         return bool(self._suspects)
 
+    @property
+    def _irregular(self) -> bool:
+        return bool(self._suspects) or self._lateness is not None or self._reconnected
+
     # -- samples out of the ordinary -------------------------------------------------------------------------------
 
     def _observe_unsure(self, ticks: int, arrival_ns: int) -> int:
@@ -168,8 +203,10 @@ class ClockStream:
             return device_ns
         x = device_ns - estimator.anchor_device
         rest = arrival_ns - estimator.anchor_host - x - estimator.fit.at(x)
-        if rest < -estimator.early_limit_ns(x) or (same_epoch and step_ns <= -STEP_BACK_NS):
+        far_off = self._reconnected and abs(rest) > RECONNECTED_NS + estimator.tolerance_ns()
+        if far_off or rest < -estimator.early_limit_ns(x) or (same_epoch and step_ns <= -STEP_BACK_NS):
             return self._suspect(ticks, arrival_ns)
+        self._reconnected = False
         estimator.counts.rejected += len(self._suspects)
         self._suspects.clear()
         if same_epoch and step_ns < 0:
@@ -177,7 +214,7 @@ class ClockStream:
             return device_ns
         if rest > self._late_ns:
             return self._late(unwrapped, arrival_ns, rest)
-        self._late_since = None
+        self._lateness = None
         return self._accept(unwrapped, arrival_ns)
 
     def _accept(self, unwrapped: int, arrival_ns: int) -> int:
@@ -192,21 +229,26 @@ class ClockStream:
         return device_ns if self._epoch == estimator.epoch else self._remember(unwrapped, arrival_ns)
 
     def _late(self, unwrapped: int, arrival_ns: int, rest: float) -> int:
-        """Held up on the way, or the device clock stood still: a backlog shrinks, a pause stays."""
+        """Held up on the way, or the device clock stood still: a backlog shrinks or wanders, a pause stays.
+
+        A pause also begins with silence of its own length, in which the device counted nothing.
+        """
         estimator = self._estimator
         estimator.counts.late += 1
+        silence_ns, step_ns = arrival_ns - self._arrival_ns, self._axis_ns(unwrapped) - self._device_ns
         device_ns = self._remember(unwrapped, arrival_ns)
-        if self._late_since is None:
-            self._late_since = (device_ns, rest)
-        waited_ns = device_ns - self._late_since[0]
-        if waited_ns < PERSISTS_NS:
+        lateness = self._lateness
+        if lateness is None:
+            is_pause = silence_ns > 0.9 * rest and step_ns < 0.1 * silence_ns
+            self._lateness = lateness = _Lateness(device_ns, PAUSE_NS if is_pause else LASTING_NS)
+        if not lateness.stays(device_ns, rest, estimator.tolerance_ns()):
+            self._lateness = lateness = _Lateness(device_ns, LASTING_NS)
+            lateness.stays(device_ns, rest, 0.0)
+        if device_ns - lateness.since_ns < lateness.limit_ns:
             return device_ns
-        if rest < self._late_since[1] - 0.1 * waited_ns:
-            self._late_since = (device_ns, rest)
-            return device_ns
-        self._late_since = None
+        self._lateness = None
         estimator.counts.resets += 1
-        estimator.begin_epoch(round(rest))
+        estimator.begin_epoch(round(min(lateness.lows)))
         return self._accept(unwrapped, arrival_ns)
 
     def _suspect(self, ticks: int, arrival_ns: int) -> int:
@@ -232,7 +274,7 @@ class ClockStream:
         else:
             estimator.counts.resets += 1
             estimator.begin_epoch(shift_ns)
-        self._late_since = None
+        self._lateness, self._reconnected = None, False
         self._ticks, self._epoch = first_ticks, -1
         for tick, arrival in suspects:
             step = (tick - self._ticks) % self._modulus if self._modulus else tick - self._ticks

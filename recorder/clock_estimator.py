@@ -93,8 +93,10 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x
     level "lowest": the curve is moved to touch the lowest point, but not further above the place where the delay law
     puts it than that may be wrong; "model": it lies there.
     """
-    trust = grid.trust
-    if trust < IGNORE_TRUST:
+    law_error = LAW_ERROR * grid.law.shape * grid.law.mean_ns
+    unsure = math.hypot(line.sigma_ns(now_x), 0.125 * grid.sd_curvature * (now_x - buckets[0].last_x) ** 2)
+    trust = grid.trust / (1 + (grid.sd_height / max(unsure, 1.0)) ** 4)
+    if grid.trust < IGNORE_TRUST:
         return line
     table = np.array(buckets, dtype=np.float64)
     table = table[table[:, 6] > now_x - GRID_LEVEL_S * S]
@@ -103,14 +105,12 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x
     clearance = float((low_y - curve).min())
     if level == "model":
         clearance = min(clearance, 0.0)
-    elif trust > MIN_TRUST:
+    elif grid.trust > MIN_TRUST:
         clearance = min(clearance, grid.sd_height + GRID_LEVEL * grid.law.mean_ns)
     here = trust * float(grid.at(np.array([now_x]))[0]) + (1 - trust) * line.at(now_x) + clearance
     slope = trust * (grid.slope + 2 * grid.curvature * (now_x - grid.pivot_x)) + (1 - trust) * line.slope
     sd_slope = trust * grid.sd_slope + (1 - trust) * line.sd_slope
-    unsure = math.hypot(
-        grid.sd_height, LAW_ERROR * grid.law.shape * grid.law.mean_ns, CLEARANCE_ERROR * max(clearance, 0.0)
-    )
+    unsure = math.hypot(grid.sd_height, law_error, CLEARANCE_ERROR * max(clearance, 0.0))
     sd_level = trust * unsure + (1 - trust) * line.sigma_ns(now_x)
     return Line(here - slope * now_x, slope, sd_slope, sd_level, now_x, line.spread_ns)
 
@@ -180,6 +180,10 @@ class Estimator:
         """How far below the line an arrival at x may be and still be believed."""
         return self.early_ns + 10 * self.fit.sd_slope * max(x - self.last_x, 0.0)
 
+    def tolerance_ns(self) -> float:
+        """How much the least delays of a steady link may differ within seconds."""
+        return EARLY_FLOOR_NS + 10 * self.fit.spread_ns
+
     # -- epochs ----------------------------------------------------------------------------------------------------
 
     def begin_epoch(self, shift_ns: int) -> None:
@@ -207,7 +211,7 @@ class Estimator:
         self._open_x: list[int] = []
         self._open_y: list[int] = []
         self._open_end = x
-        self._high_since: float | None = None
+        self._high_since: tuple[float, float] | None = None  # where, how high
         self._ready: tuple[int, Line] | None = None
 
     # -- learning --------------------------------------------------------------------------------------------------
@@ -267,12 +271,13 @@ class Estimator:
             return
         x, y = self._open_points()
         bucket = summarise(x, y, self.fit.slope)
-        self._buckets.append(bucket)
+        if bucket.low_y - self.fit.at(bucket.low_x) <= self.early_ns:  # else held up: no clock drifts so fast
+            self._buckets.append(bucket)
         if self.grid is not None:
             self.grid.feed(x, y, self.fit.slope)
         self._open_x, self._open_y = [], []
         self._open_end = last + self._pace_ns(BUCKET_S[1])
-        while last - self._buckets[0].last_x > WINDOW_S * S:
+        while self._buckets and last - self._buckets[0].last_x > WINDOW_S * S:
             del self._buckets[0]
         if self._stood_still(bucket):
             self.counts.resets += 1
@@ -292,19 +297,20 @@ class Estimator:
 
     def _stood_still(self, bucket: Bucket) -> bool:
         """Whole buckets far above the line for seconds: the device clock has paused."""
-        if bucket.low_y - self.fit.at(bucket.low_x) <= self.early_ns:
+        height = bucket.low_y - self.fit.at(bucket.low_x)
+        if height <= self.early_ns:
             self._high_since = None
             return False
-        if self._high_since is None:
-            self._high_since = bucket.low_x
-        return bucket.last_x - self._high_since >= PERSISTS_NS
+        if self._high_since is None or abs(height - self._high_since[1]) > 0.5 * self.tolerance_ns():
+            self._high_since = bucket.low_x, height  # a backlog is not as steady as a pause
+        return bucket.last_x - self._high_since[0] >= PERSISTS_NS
 
     def refit(self) -> None:
         """Work out the line anew; a worker may call it when `refit_due`."""
         self.refit_due = False
         epoch, buckets, prior = self.epoch, self._buckets[:], self._prior
         if buckets:
-            line = blend(buckets, prior, self.grid.period_ns if self.grid is not None else 0.0)
+            line = blend(buckets, prior, self.grid.hides if self.grid is not None else None)
             if self.grid is not None:
                 line = line.less_sure(self.grid.unseen_ns(self._age_s()))
             self.grid_line = self.grid.fit(line, prior) if self.grid is not None else None

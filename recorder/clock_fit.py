@@ -15,6 +15,7 @@ Samples are condensed into buckets of about a second.  Everything here is a plai
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -31,11 +32,23 @@ CLIP = (
 )
 SHRINK = 0.6
 LEAST_DOUBT = 1e-6  # arrivals without any jitter leave none, and a weight must stay finite
+BLOCKS = 12
+UNSTEADY = 12.0
+TOUCHING = 1.4
+LEVEL = 0.4  # error of the level by that of slope times span
+HIDDEN_LEVEL = 0.3
+GATHERED = 0.3  # spacing of delays below which polls gather them
+WANDER = 1.5  # a step of the mean delay by 1 in the middle of the span turns a line through the means by so much
+DRIFT = 0.1e-6 / S  # change of the skew, per ns: a fast warm-up
 FIRST_WINDOW_S = 20.0  # the window is not cut below this
 
 
 class Bucket(NamedTuple):
-    """About a second of samples: the least delayed one, and the mean of all with long delays clipped."""
+    """About a second of samples: the least delayed one, and the mean of all with long delays clipped.
+
+    spacing: of neighbouring delays, as a share of what it is when they are spread smoothly; small where polls gather
+    them.
+    """
 
     low_x: float
     low_y: float
@@ -44,6 +57,7 @@ class Bucket(NamedTuple):
     sd_mean: float
     samples: float
     last_x: float
+    spacing: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +110,10 @@ def summarise(x: Floats, y: Floats, slope: float) -> Bucket:
     mean_x = float(x.mean())
     mean_y = float(clipped.mean()) + slope * (mean_x - float(x[0]))
     sd = float(clipped.std()) / math.sqrt(height.size)
-    return Bucket(float(x[low]), float(y[low]), mean_x, mean_y, sd, float(x.size), float(x[-1]))
+    middle = order[order.size // 4 : 3 * order.size // 4 + 1]
+    expected = math.log(2) * (middle[-1] - middle[0]) / max(middle.size - 1, 1)
+    spacing = float(np.median(np.diff(middle))) / expected if expected > 0 else 1.0
+    return Bucket(float(x[low]), float(y[low]), mean_x, mean_y, sd, float(x.size), float(x[-1]), spacing)
 
 
 def lower_hull(x: Floats, y: Floats) -> list[int]:
@@ -132,10 +149,10 @@ def hull_slope(x: Floats, y: Floats) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-def mean_slope(x: Floats, y: Floats, sd: Floats) -> tuple[float, float]:
-    """Slope of a robust line through bucket means, and its sigma from the scatter around it."""
+def mean_slope(x: Floats, y: Floats, sd: Floats) -> tuple[float, float, float]:
+    """Slope of a robust line through bucket means, its sigma from the scatter around it, and the scatter."""
     if x.size < 4:
-        return 0.0, math.inf
+        return 0.0, math.inf, 0.0
     scale = max(float(np.median(sd)), 1.0)
     weight = np.ones_like(x)
     slope = 0.0
@@ -145,56 +162,77 @@ def mean_slope(x: Floats, y: Floats, sd: Floats) -> tuple[float, float]:
         dx = x - cx
         moment = float(weight @ dx**2)
         if moment <= 0:
-            return 0.0, math.inf
+            return 0.0, math.inf, 0.0
         slope = float((weight * dx) @ (y - cy)) / moment
         rest = np.abs(y - cy - slope * dx)
         scale = max(1.4826 * float(np.median(rest)), 1e-3 * scale, 1.0)
         weight = np.minimum(1.0, 1.5 * scale / np.maximum(rest, 1e-9)) * (rest < 6 * scale)
         if weight.sum() < 3:
-            return 0.0, math.inf
+            return 0.0, math.inf, 0.0
     rest_signed = (y - cy - slope * dx) * (weight > 0)
     power = float(rest_signed @ rest_signed)
     # slow changes of the delay leave long runs of one sign: so many independent points are there (Wald-Wolfowitz)
     runs = 1 + int(np.count_nonzero(np.diff(np.sign(rest_signed))))
     sigma = math.sqrt(power / max(int(np.count_nonzero(weight)), 1) / moment)
-    return slope, sigma * math.sqrt(x.size / min(x.size, 2 * runs))
+    return slope, sigma * math.sqrt(x.size / min(x.size, 2 * runs)), scale
 
 
-def blend(buckets: list[Bucket], prior: SlopePrior, period_ns: float = 0.0) -> Line:
+class Hidden(NamedTuple):
+    """What polls keep from sight: how far above the floor all arrivals may be, and how far that may change slowly."""
+
+    level_ns: float
+    slope_ns: float
+
+
+Hides = Callable[[float], Hidden]  # by slope
+
+
+def blend(buckets: list[Bucket], prior: SlopePrior, hides: Hides | None = None) -> Line:
     """Best line under the buckets: prior, means and hull edge weighed by their variances, level by the lowest.
 
     The means dither a polled link's quantisation away but follow the load; the hull edge does the opposite.
-    period_ns: of the link's polls, if they are known.
+    hides: what the polls of the link hide, where they are known.
     """
     table = np.array(buckets, dtype=np.float64)
     pivot = float(table[-1, 6])
+    wander = 0.0
     while True:
-        line, clear = _blend_window(table, prior, pivot, period_ns)
+        line, clear, wander = _blend_window(table, prior, pivot, hides, wander)
         span = float(table[-1, 6] - table[0, 0])
         if not clear or span < FIRST_WINDOW_S * S:
             return line
         table = table[table[:, 6] >= pivot - SHRINK * span]
+        sigma = math.hypot(line.sd_slope, DRIFT * span)
+        if sigma < prior.sigma:
+            prior = SlopePrior(line.slope, sigma)
 
 
-def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: float) -> tuple[Line, bool]:
-    """The line of one window, and whether a third of the window stays clear of it."""
+def _blend_window(
+    table: Floats, prior: SlopePrior, pivot: float, hides: Hides | None, wander: float
+) -> tuple[Line, bool, float]:
+    """The line of one window, whether a third of the window stays clear of it, and how far the mean delays wander."""
     low_x, low_y, mean_x, mean_y, sd_mean = (table[:, i] for i in range(5))
     span = max(float(low_x[-1] - low_x[0]), 1.0)
     flat = mean_y - low_y - prior.slope * (mean_x - low_x)
-    spread = max(float(np.median(flat)), 0.5 * period_ns, 1.0)
+    spread = max(float(np.median(flat)), 1.0)
     minutes = span / (60 * S)
+    gathered = hides is None and float(np.median(table[:, 7])) < GATHERED
+    hidden = Hidden(*[spread * math.exp(-4 * minutes) if gathered else 0.0] * 2)
     weight = [1 / prior.sigma**2]
     slopes = [prior.slope]
-    slope_means, sd_means = mean_slope(mean_x, mean_y, sd_mean)
+    slope_means, sd_means, scatter = mean_slope(mean_x, mean_y, sd_mean)
     if math.isfinite(sd_means):
-        sd_means = math.hypot(sd_means, 0.02 * spread / span) * (1 + minutes**1.25)
+        white = 1.5 * float(np.median(sd_mean))
+        sd_means = math.hypot(sd_means, (0.02 * spread + WANDER * wander) / span) * (1 + minutes**1.25)
+        wander = max(wander, math.sqrt(max(scatter**2 - white**2, 0.0)))
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
-            height = low_y - slope_hull * low_x
-            unsteady = min(4 * float(np.median(height) - height.min()) / spread, 1.0)
-            doubt = 1.0 if period_ns else max(unsteady**2, math.exp(-4 * minutes), LEAST_DOUBT)
-            sd_hull = 2.5 / (1 + minutes) * doubt * spread / span * (1 + span / (2 * length))
+            unsure = _touching_error(low_y - slope_hull * low_x)
+            if hides is not None:
+                hidden = hides(slope_hull)
+            unsteady = 0.0 if hides is not None else min(UNSTEADY * unsure / spread, 1.0) ** 4 * 4.0 / (1 + minutes)
+            sd_hull = math.hypot(unsure, hidden.slope_ns, max(unsteady, LEAST_DOUBT) * spread) / span
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
             slopes.append(slope_hull)
@@ -204,17 +242,28 @@ def _blend_window(table: Floats, prior: SlopePrior, pivot: float, period_ns: flo
         weight.append(1 / sd_means**2)
     slope = float(np.dot(slopes, weight) / np.sum(weight))
     sd_slope = 1 / math.sqrt(sum(weight))
+    if hides is not None:
+        hidden = hides(slope)
     height = low_y - slope * low_x
     lowest = int(np.argmin(height))
     above = height - height[lowest]
     thirds = np.array_split(above, 3)
     limit = max(0.5 * spread, 2 * float(np.median(above)))
     clear = above.size >= 9 and any(float(part.min()) > limit for part in thirds)
-    sd_slope = min(sd_slope, _slope_room(low_x, above, lowest) + 0.5 * spread / span * math.exp(-minutes))
-    unsteady = min(4 * float(np.median(above)) / spread, 1.0)
-    gap = float(np.sort(above)[min(2, above.size - 1)])
-    level = max(gap, 0.005 * spread) + 0.2 * unsteady * spread / (1 + minutes)
-    return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear
+    room = _slope_room(low_x, above, lowest) + 0.5 * spread / span * math.exp(-minutes)
+    sd_slope = min(sd_slope, math.hypot(room, hidden.slope_ns / span))
+    level = math.hypot(LEVEL * _touching_error(height), HIDDEN_LEVEL * hidden.level_ns, 0.001 * spread)
+    return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear, wander
+
+
+def _touching_error(height: Floats) -> float:
+    """One sigma of the slope times the span of a line laid under points, from their heights above it.
+
+    The typical least height in a twelfth of the span; the factors are from trials with gamma laws of shapes 0.7 to 2,
+    steady and in waves.
+    """
+    low = np.array([part.min() for part in np.array_split(height - height.min(), min(BLOCKS, height.size))])
+    return TOUCHING * float(np.median(low)) * (BLOCKS / low.size) ** 1.7
 
 
 def _slope_room(x: Floats, above: Floats, lowest: int) -> float:

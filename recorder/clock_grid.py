@@ -36,6 +36,7 @@ LOST_PIECES = 7
 OFF_GRID = 0.015  # of the period: a bucket further from its polls belongs to another grid
 CELLS_PER_PERIOD = 40
 RESIDUES = 30
+EVENTS = 20
 
 SHAPES = np.geomspace(0.5, 10.0, 73)  # of the gamma law
 UNITS = np.linspace(0.0, 7.0, 280) ** 2  # delays in units of the law's scale
@@ -71,6 +72,7 @@ class GridPoints:
     residues: Ints  # how many polls have each index modulo RESIDUES
     jitter_ns: float
     spread_ns: float  # of the delays, 10 to 75 %
+    events_x: Floats  # of some of the arrivals, for their phases
 
 
 # -- the delay law ----------------------------------------------------------------------------------------------------
@@ -226,6 +228,11 @@ class GridTracker:
         self.period_ns = 0.0  # nominal; 0 while none is found
         self._forget()
 
+    @property
+    def frequency(self) -> float:
+        """How much longer than nominal the period is, relative."""
+        return self._frequency
+
     def _forget(self) -> None:
         self.period_ns = 0.0
         self._power = np.zeros(len(PERIODS_NS))
@@ -358,10 +365,11 @@ def snap(x: Floats, y: Floats, slope: float, tracker: GridTracker) -> GridPoints
     polls, on_grid, index, jitter = followed
     x, index = x[on_grid], index[on_grid]
     y = polls[on_grid] - x
+    events_x = x[:: x.size // EVENTS + 1]
     residues = np.bincount(index % RESIDUES, minlength=RESIDUES)
     if x.size <= 2 * CELLS_PER_PERIOD:
-        return GridPoints(x, y, np.ones_like(x), residues, jitter, spread)
+        return GridPoints(x, y, np.ones_like(x), residues, jitter, spread, events_x)
     cell = np.floor((y - slope * (x - x[0])) * (CELLS_PER_PERIOD / tracker.period_ns)).astype(np.int64)
     _, cell, count = np.unique(cell, return_inverse=True, return_counts=True)
     mean_x, mean_y = np.bincount(cell, x) / count, np.bincount(cell, y) / count
-    return GridPoints(mean_x, mean_y, count.astype(np.float64), residues, jitter, spread)
+    return GridPoints(mean_x, mean_y, count.astype(np.float64), residues, jitter, spread, events_x)

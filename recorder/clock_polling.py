@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recorder.clock_fit import Floats, Line, SlopePrior
+from recorder.clock_fit import Floats, Hidden, Hides, Line, SlopePrior
 from recorder.clock_grid import (
     LAW_PRIOR,
     RESIDUES,
@@ -51,7 +51,10 @@ COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows
 
 @dataclass(frozen=True, slots=True)
 class GridLine:
-    """What the grid says: height (ns), slope and curvature (per ns) at `pivot_x`, one sigma of each, and the trust."""
+    """What the grid says: height (ns), slope and curvature (per ns) at `pivot_x`, one sigma of each, and the trust.
+
+    sd_curvature: what is usual with this clock.
+    """
 
     pivot_x: float
     height: float
@@ -59,6 +62,7 @@ class GridLine:
     curvature: float
     sd_height: float
     sd_slope: float
+    sd_curvature: float
     trust: float
     law: DelayLaw
 
@@ -106,6 +110,26 @@ class PollingGrid:
     def period_ns(self) -> float:
         """Of the polls; 0 without a grid, or when steady delays make the device's own rhythm look like one."""
         return self.tracker.period_ns if self._real else 0.0
+
+    @property
+    def hides(self) -> Hides | None:
+        """How far the floor may be hidden, by the slope: the widest gap between the samples' phases against the polls.
+
+        A line that follows the polls' clock has a gap of nearly a period. A slow period is a latency timer on top of
+        finer polls, and the floor moves with their beat. None if no polls are known.
+        """
+        period = self.period_ns * (1 + self.tracker.frequency)
+        if not period or not self.points:
+            return None
+        first = self.points[0].x[0]
+        x = np.concatenate([p.events_x - first for p in self.points])
+
+        def hidden(slope: float) -> Hidden:
+            phase = np.sort(x * (1 + slope) % period)
+            gap = float(np.diff(phase, append=phase[0] + period).max())
+            return Hidden(gap, gap if period < COARSE_NS else period)
+
+        return hidden
 
     def unseen_ns(self, age_s: float) -> float:
         """One sigma of the height above the floor that the polls may hide from a line under the arrivals.
@@ -184,6 +208,7 @@ class PollingGrid:
             self._last.curvature,
             sd[0],
             sd[1] / S,
+            math.sqrt(self._bending) / S**2,
             trust,
             DelayLaw.of(fitted.law),
         )

@@ -125,6 +125,10 @@ class Pipeline:
         text = f"the host slept for {duration_ns / NS_PER_S:.3f} s: all clocks begin a new sync epoch"
         self._writer.events.write("host", "suspend", text)
 
+    def reconnected(self, device: str) -> None:
+        """The device was lost and is connected again; what it sends from now on may be by a restarted clock."""
+        self._timebase.reconnected(device)
+
     def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
         """Feed one sample with its arrival on the host's monotonic clock."""
         if isinstance(sample, ClockPairs):

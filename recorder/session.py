@@ -291,7 +291,7 @@ class Take:
             self._writer.raw.put_chunks(name, item.chunks)
             for event in item.events:
                 self._note(name, event)
-            if not item.samples:
+            if not item.samples and not _is_connected(item):
                 continue
             if self._inbox.offer((name, item), _size(item)):
                 self._note_burst(name, burst)
@@ -343,6 +343,8 @@ class Take:
         """Hand samples to the pipeline; those that came after `until_ns` are given back."""
         left = []
         for name, item in items:
+            if _is_connected(item):
+                self._pipeline.reconnected(name)
             for arrival_ns, sample in item.samples:
                 if until_ns is None or arrival_ns <= until_ns:
                     self._pipeline.take(name, arrival_ns, sample)
@@ -492,4 +494,9 @@ def _placeholders(item: Received) -> Received:
         for arrival_ns, sample in item.samples
         if isinstance(sample, FrameSample)
     ]
-    return Received(samples=tuple(kept))
+    return Received(samples=tuple(kept), events=item.events)
+
+
+def _is_connected(item: Received) -> bool:
+    """Whether these are a device's first data since it was connected."""
+    return any(event.kind == "connected" for event in item.events)

@@ -121,6 +121,10 @@ class Timebase:
             clock.is_new = True
             clock.hold_until_ns = max(clock.hold_until_ns, now_ns + HOLD_NS)
 
+    def reconnected(self, device: str) -> None:
+        """The device was lost and is connected again: its clock may have restarted."""
+        self._streams[device].stream.expect_restart()
+
     def epochs_begun(self) -> list[tuple[str, int]]:
         """Clocks (with their epoch) that began a new sync epoch since this was last called."""
         begun, self._epochs_begun = self._epochs_begun, []

@@ -242,6 +242,70 @@ def test_pause_of_the_device_clock(by_s: float) -> None:
     assert rms_us(refine(t.ticks, t.arrival_ns, 1e6), t, after_s=24.0) < 60
 
 
+def test_pause_of_the_device_clock_is_known_within_a_second_or_so() -> None:
+    t = trace(duration_s=40.0, start_ticks=10**9)
+    gone = (t.true_ns >= BOOT_NS + 20 * 10**9) & (t.true_ns < BOOT_NS + 24 * 10**9)
+    t = jumped(Trace(t.true_ns[~gone], t.ticks[~gone], t.arrival_ns[~gone]), 20.0, -4.0)
+    clock = ClockMap(1e6)
+    stamps_ns = t.mapped(clock)
+    assert clock.epoch == 1
+    late = t.true_ns > BOOT_NS + 25.1 * 10**9
+    assert np.abs(stamps_ns - t.true_ns)[late].max() < 5 * MS
+
+
+@pytest.mark.parametrize("lost_share", [0.0, 0.4])
+@pytest.mark.parametrize("backlog_s", [0.3, 2.0, 4.2])
+def test_lasting_backlog_is_no_pause(backlog_s: float, lost_share: float) -> None:
+    """An overloaded host reads half a minute behind, by more or less, and catches up at last."""
+    t = trace(duration_s=60.0, rate_hz=400.0)
+    seconds = (t.true_ns - BOOT_NS) / 1e9
+    busy = (seconds > 20) & (seconds < 50)
+    rng = np.random.default_rng(3)
+    wander = 1 + 0.25 * np.interp(seconds, np.arange(61.0), rng.uniform(-1, 1, 61))
+    behind_ns = np.where(busy, backlog_s * wander * np.minimum(1, 0.5 * (50 - seconds)) * 1e9, 0).astype(np.int64)
+    arrival_ns = np.maximum.accumulate(t.arrival_ns + behind_ns)
+    kept = ~busy | (rng.random(seconds.size) >= lost_share)
+    t = Trace(t.true_ns[kept], t.ticks[kept], arrival_ns[kept])
+    clock = ClockMap(1e6)
+    stamps_ns = t.mapped(clock)
+    assert_causal(stamps_ns, t)
+    assert clock.epoch == 0
+    assert np.abs(stamps_ns - t.true_ns)[t.true_ns > BOOT_NS + 5 * 10**9].max() < 1 * MS
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_device_that_restarts_again_and_again(announced: bool) -> None:
+    whole = trace(duration_s=16.0, rate_hz=1000.0, tick_hz=10_000, wrap_bits=32)
+    seconds = (whole.true_ns - BOOT_NS) / 1e9
+    here = seconds % 1.5 < 1.1
+    start_s = seconds - seconds % 1.5
+    ticks = whole.ticks - np.round(start_s * (1 + 40e-6) * 10_000).astype(np.int64) + 50
+    t = Trace(whole.true_ns[here], ticks[here], whole.arrival_ns[here])
+    clock = ClockMap(10_000, 32)
+    stream = clock.stream(10_000, 32)
+    stamps_ns = []
+    for i, (tick, arrival) in enumerate(zip(t.ticks.tolist(), t.arrival_ns.tolist(), strict=True)):
+        if announced and i and arrival - t.arrival_ns[i - 1] > 300 * MS:
+            stream.expect_restart()
+        stamps_ns.append(stream.map(tick, arrival))
+    assert_causal(np.array(stamps_ns), t)
+    assert (clock.epoch, clock.resets, clock.late) == (10, 10, 0)
+    error_ns = np.abs(stamps_ns - t.true_ns)
+    assert np.quantile(error_ns, 0.99) < 1 * MS
+    assert error_ns.max() < 3 * MS
+
+
+def test_reconnected_clock_that_ran_on_keeps_its_epoch() -> None:
+    t = trace(duration_s=20.0)
+    clock = ClockMap(1e6)
+    stream = clock.stream(1e6)
+    for i, (tick, arrival) in enumerate(zip(t.ticks.tolist(), t.arrival_ns.tolist(), strict=True)):
+        if i in (1000, 2500):
+            stream.expect_restart()
+        stream.map(tick, arrival)
+    assert clock.epoch == 0
+
+
 def test_announced_suspend_is_exact_at_once() -> None:
     t = jumped(trace(duration_s=40.0), 20.0, 30.0)
     clock = ClockMap(1e6)
