@@ -25,6 +25,7 @@ from recorder.recording.check import check as check_recording
 from recorder.recording.check import print_report
 from recorder.recording.info import info as recording_info
 from recorder.recording.info import print_info
+from recorder.recording.recover import recover as recover_recording
 from recorder.resync import resync as resync_recording
 from recorder.rig import Rig, load_rig, parse_rig
 from recorder.session import record as record_take
@@ -242,6 +243,38 @@ def decode(verbose: bool, capture: Path, driver: str, output: Path, settings: tu
     if decoded.fault:
         click.echo(f"rigtape: {decoded.fault}; what comes before is in {decoded.folder}", err=True)
         sys.exit(1)
+
+
+@main.command()
+@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.pass_obj
+def recover(verbose: bool, recording: Path) -> None:
+    """Make a recording that broke off (a kill, a crash, a full disk) exact.
+
+    The videos get their index, data.jsonl names what is there and nothing else, late lines come to their place,
+    recording.json its counts and checksums. The files as they were found stay in RECORDING/before_recovery. A recovery
+    that is cut short is done again by the next one.
+
+    Exit code 0: all that had reached the disk was kept; 3: something was lost, and what; 1: there is nothing to save.
+
+    \b
+    Example:
+      rigtape recover demo/2026-11-22T10-00-00Z
+    """
+    console = Console()
+    errors = Console(stderr=True)
+    with clear_errors(verbose), Progress(console=errors, transient=True, disable=not errors.is_terminal) as bar:
+        task = bar.add_task(f"recovering {recording}", total=1.0)
+        recovered = recover_recording(recording, progress=lambda done: bar.update(task, completed=done))
+    for text in recovered.notes:
+        console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
+    for text in recovered.lost:
+        console.print(f"lost: {text}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"next: rigtape check {recording}", soft_wrap=True)
+    if recovered.manifest.resync is None:
+        console.print(f"      rigtape resync {recording}", soft_wrap=True)
+    if recovered.lost:
+        sys.exit(3)
 
 
 @main.command()

@@ -12,8 +12,6 @@ The order of samples of one stream never changes, so pictures stay in step with 
 """
 
 import heapq
-import os
-import shutil
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
@@ -29,7 +27,7 @@ import numpy as np
 from drivers.samples import POINT_DTYPE
 from recorder.errors import StorageError, StorageFullError
 from recorder.recording.check_data import path_inside
-from recorder.recording.folder import free_bytes, low_water_bytes
+from recorder.recording.folder import free_bytes, link_or_copy, low_water_bytes
 from recorder.recording.jsonl import DATA_NAME, encode_json
 from recorder.recording.lidar import FOLDER as LIDAR_FOLDER
 from recorder.recording.manifest import (
@@ -250,7 +248,7 @@ class _Target:
             if path.is_dir():
                 (self._folder / name).mkdir(exist_ok=True)
             elif not is_rewritten and str(name) not in (DATA_NAME, ONLINE_NAME, MANIFEST_NAME):
-                _link_or_copy(path, self._folder / name)
+                link_or_copy(path, self._folder / name)
 
     def write_line(self, line: bytes) -> None:
         """Append to data.jsonl."""
@@ -285,25 +283,13 @@ class _Target:
             sync_folder(self._folder / LIDAR_FOLDER)
         if not online.exists():
             former = self._source / ONLINE_NAME
-            _link_or_copy(former if former.exists() else self._source / DATA_NAME, online)
+            link_or_copy(former if former.exists() else self._source / DATA_NAME, online)
             sync_folder(online.parent)
         self._entries[ONLINE_NAME] = hash_file(online)
         data.with_suffix(data.suffix + ".tmp").replace(data)
         sync_folder(self._folder)
         manifest.files = dict(sorted((manifest.files | self._entries).items()))
         write_manifest(self._folder, manifest)
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    """The same file under another name, or where the file system does not allow that a copy, there whole or not."""
-    try:
-        os.link(source, target)
-    except OSError:
-        temporary = target.with_name(target.name + ".tmp")
-        shutil.copyfile(source, temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(target)
 
 
 class _LineTimes:

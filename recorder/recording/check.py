@@ -19,6 +19,7 @@ from recorder.recording.manifest import EVENTS_NAME, MANIFEST_NAME, Manifest, re
 from recorder.recording.reader import DATA_NAME, MAX_LINE_BYTES, StreamStats, VideoStats, find_videos, read_video
 
 CALIBRATION_NAME = "calibration.json"
+BACKUP = "before_recovery"
 RATE_TOLERANCE = 0.05
 EDGE_S = 3.0  # how much later than the others a stream may begin, or earlier than the take end
 ACCEL_MEAN_MIN_M_S2, ACCEL_MEAN_MAX_M_S2 = 8.0, 12.0
@@ -97,7 +98,10 @@ def _check_manifest(folder: Path, findings: Findings) -> Manifest | None:
         findings.add("error", "manifest", MANIFEST_NAME, f"cannot be read: {error}")
         return None
     if manifest.state == "recording":
-        text = "the take broke off (or still runs): its files are readable as they are, up to about the last second"
+        text = (
+            "the take broke off (or still runs): its files are readable as they are, up to about the last second; "
+            "`rigtape recover` makes them exact"
+        )
         findings.add("error", "not-complete", MANIFEST_NAME, text)
     elif manifest.state == "recovered":
         findings.add("note", "recovered", MANIFEST_NAME, "the take broke off and was recovered")
@@ -213,6 +217,8 @@ def _check_left_over(folder: Path, scan_files: set[str], findings: Findings) -> 
         if f"lidar/{path.name}" not in scan_files:
             findings.add("warning", "scan-unlisted", "lidar", f"{path.name} has no line in {DATA_NAME}")
     for path in sorted([*folder.rglob("*.tmp"), *folder.glob("late.jsonl")]):
+        if BACKUP in path.parts:
+            continue
         text = f"{path.relative_to(folder)} was left over from a take that was not ended"
         findings.add("warning", "left-over", "files", text)
 

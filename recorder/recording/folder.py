@@ -1,6 +1,8 @@
 """Where a take goes, and whether there is room for it."""
 
+import fcntl
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -60,3 +62,31 @@ def create_take_folder(out: Path, name: str | None, utc_ns: int) -> Path:
             raise StorageError(f"{folder}: cannot create: {error.strerror or error}") from error
         return folder
     raise StorageError(f"{out}: cannot find a free name for the take")
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """The same file under another name, or where the file system does not allow that a copy, there whole or not."""
+    try:
+        os.link(source, target)
+    except OSError:
+        temporary = target.with_name(target.name + ".tmp")
+        shutil.copyfile(source, temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(target)
+
+
+def lock_folder(folder: Path) -> int:
+    """Claim a recording for this process, until the descriptor is closed or the process ends, however it does.
+
+    Raises StorageError when another one writes there. Where the file system knows no locks nobody is kept out.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise StorageError(f"{folder}: another process is writing there: is the take still running?") from None
+    except OSError:
+        pass
+    return descriptor

@@ -183,9 +183,12 @@ class LineWriter:
         while waiting or not self._queue.ended:
             waiting.extend(self._queue.get_all(FLUSH_S))
             self._write_ready(waiting)
-            self._file.flush()
+            files = [self._file] if self._late_file is None else [self._file, self._late_file]
+            for file in files:
+                file.flush()
             if time.monotonic() - last_sync_s >= SYNC_S:
-                self._file.sync()
+                for file in files:
+                    file.sync()
                 last_sync_s = time.monotonic()
             time.sleep(FLUSH_S / 2)  # collects lines: one write for many
 
@@ -258,7 +261,7 @@ def merge_late_lines(folder: Path) -> FileEntry:
     merged_path = folder / (DATA_NAME + ".tmp")
     merged = HashedFile(merged_path)
     number = 0
-    for line in _joined(_merged(_decoded_lines(data_path), iter(late))):
+    for line in joined_frames(_merged(_decoded_lines(data_path), iter(late))):
         if "frames" in line:
             line["number"] = number
             number += 1
@@ -291,7 +294,7 @@ def _merged(
         next_late = next(late, None)
 
 
-def _joined(lines: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+def joined_frames(lines: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Join frames lines of one instant: cameras whose pictures came apart belong to one set."""
     held: list[dict[str, Any]] = []  # lines of one time that hold a frames line
     for line in lines:

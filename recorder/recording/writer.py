@@ -5,6 +5,7 @@
 Times are nanoseconds of recording time. Not thread safe but for `event` and `raw`: one thread calls it.
 """
 
+import os
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ import numpy.typing as npt
 
 from drivers.samples import DeviceEvent, FixSample, FrameSample, ImuSample, PoseSample, ScanSample
 from recorder.recording.encoder import VideoSettings
+from recorder.recording.folder import lock_folder
 from recorder.recording.jsonl import (
     LineWriter,
     PendingFrames,
@@ -77,7 +79,7 @@ class RecordingWriter:
         video: VideoSettings | None = None,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Create all files in an existing, empty folder.
+        """Create all files in an existing, empty folder, which is locked until the end.
 
         video: how raw pictures are encoded. monotonic_ns: the clock that stamps events.
         """
@@ -89,6 +91,7 @@ class RecordingWriter:
             on_error(name, error)
 
         self._failed: OnError = failed
+        self._lock = lock_folder(folder)
         self.folder = folder
         self.manifest = manifest
         start_ns = manifest.start_monotonic_ns
@@ -208,6 +211,7 @@ class RecordingWriter:
             write_manifest(self.folder, self.manifest)
         except OSError as error:
             faults.append(f"{MANIFEST_NAME}: {error}")
+        os.close(self._lock)
         return faults
 
 
