@@ -28,6 +28,7 @@ FLUSH_S = 0.1
 SYNC_S = 1.0
 QUEUE_BYTES = 64 << 20
 LINE_BYTES = 300
+MILLIMETRE_M = 0.001
 
 encode_json = msgspec.json.Encoder().encode
 
@@ -47,12 +48,14 @@ class SensorLine(msgspec.Struct):
 
 
 class FrameEntry(msgspec.Struct, omit_defaults=True):
-    """One camera's picture within a frames line."""
+    """One camera's picture within a frames line. colorFormat, depthScale (metres of one unit): of depth only."""
 
     cameraInd: int  # noqa: N815 - key of the format
     time: float
     exposureTimeSeconds: float | None = None  # noqa: N815
     missingBitmap: bool = False  # noqa: N815
+    colorFormat: str | None = None  # noqa: N815
+    depthScale: float | None = None  # noqa: N815
 
 
 class FramesLine(msgspec.Struct):
@@ -69,6 +72,13 @@ class PendingPicture:
 
     ticket: Ticket | None
     exposure_s: float | None
+    is_depth: bool = False
+
+    def entry(self, camera: int, time_s: float) -> FrameEntry:
+        """As it stands in the line, when the ticket is decided."""
+        is_missing = self.ticket is None or self.ticket.state == "failed"
+        depth = ("gray16", MILLIMETRE_M) if self.is_depth else (None, None)
+        return FrameEntry(camera, time_s, self.exposure_s, is_missing, *depth)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,10 +220,7 @@ class LineWriter:
         if isinstance(pending, PendingScan):
             return pending.line if pending.ticket.state == "done" else None
         time_s = pending.time_ns / NS_PER_S
-        entries = [
-            FrameEntry(index, time_s, picture.exposure_s, picture.ticket is None or picture.ticket.state == "failed")
-            for index, picture in enumerate(pending.pictures)
-        ]
+        entries = [picture.entry(index, time_s) for index, picture in enumerate(pending.pictures)]
         if all(entry.missingBitmap for entry in entries):
             return None
         line = encode_json(FramesLine(entries, self.frames_written, time_s))

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.samples import DeviceEvent, FixSample, FrameSample, ImuSample, PoseSample, ScanSample
-from recorder.recording.encoder import VideoSettings
+from recorder.recording.encoder import DEPTH, VideoSettings
 from recorder.recording.folder import lock_folder
 from recorder.recording.jsonl import (
     LineWriter,
@@ -160,7 +160,8 @@ class RecordingWriter:
         pending = []
         for video, picture in zip(self.videos, pictures, strict=True):
             ticket: Ticket | None = video.put(time_ns, picture) if picture is not None else None
-            pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None))
+            is_depth = picture is not None and picture.video.pixel_format == DEPTH
+            pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None, is_depth))
         self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
 
     def write_clock(self, state: ClockState) -> None:
