@@ -308,7 +308,7 @@ def joined_frames(lines: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         if held and line["time"] != held[0]["time"]:
             yield from held
             held = []
-        partner = next((other for other in held if "frames" in other), None)
+        partner = next((other for other in reversed(held) if "frames" in other), None)
         if partner is not None and "frames" in line and _fill_missing(partner["frames"], line["frames"]):
             continue
         if held or "frames" in line:

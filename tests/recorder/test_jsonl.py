@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -272,6 +272,7 @@ LINE = st.tuples(st.integers(0, 200), st.sampled_from(["plain", "left", "right",
 
 @settings(max_examples=50, deadline=None)
 @given(in_time=st.lists(LINE, max_size=30), late=st.lists(LINE, max_size=10))
+@example(in_time=[], late=[(0, "left"), (0, "both"), (0, "right")])
 def test_merging_keeps_every_line_and_picture_in_order(tmp_path_factory, in_time, late):
     """Pictures carry a serial number here; each camera's must come in time order, and the times ascend."""
     folder = tmp_path_factory.mktemp("merge")
