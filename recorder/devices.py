@@ -333,9 +333,7 @@ def _entries(found: Found) -> Iterator[tuple[str, str, dict[str, Any]]]:
         kind = "gnss" if port.driver == "nmea" else "imu" if port.driver else "serial"
         yield kind, describe_port(port), entry
     for camera in found.cameras:
-        # Cameras that compress by themselves give whole pictures; raw ones are too much for a recording.
-        options = {"format": "v4l2", "options": {"input_format": "mjpeg"}}
-        yield "camera", f"{camera.name} ({camera.device})", {"driver": "stream", "url": camera.path, **options}
+        yield "camera", f"{camera.name} ({camera.device})", {"driver": "v4l2", "path": camera.path}
     for oak in found.oak_devices:
         yield "oak", f"OAK {oak.name}, {oak.state}", {"driver": "oak", "device_id": oak.device_id}
     for lidar in found.lidars:

@@ -27,7 +27,8 @@ from drivers.links import SILENCE_S, GarbageWatch
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, Sample, VideoFormat
 
 INTER_CODED = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "mpeg4"})
-INTRA_CODED = frozenset({"mjpeg"})
+INTRA_CODED = frozenset({"mjpeg", "rawvideo"})
+RAW_FORMATS = frozenset({"gray", "gray16le", "nv12", "yuv420p", "yuyv422", "bgr24", "rgb24"})
 ANNEX_B_FILTERS = {"h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb"}
 # How a key frame shows that it carries its headers: the sequence parameter set, or MPEG-4's video object layer.
 HEADERS = {
@@ -36,6 +37,7 @@ HEADERS = {
     "mpeg4": re.compile(rb"\x00\x00\x01[\x20-\x2f]"),
 }
 OPEN_TIMEOUT_S = 5.0
+POLL_S = 0.002
 # FFmpeg looks at the first picture only, and hands it on: `fflags nobuffer` would keep what was looked at, which is
 # the first key frame, and all pictures up to the second one would be worthless.
 LIVE_OPTIONS = {"probesize": "32", "analyzeduration": "0"}
@@ -138,6 +140,11 @@ class StreamDriver:
         if codec not in INTER_CODED | INTRA_CODED:
             allowed = ", ".join(sorted(INTER_CODED | INTRA_CODED))
             raise DeviceError(f"{self._shown_url}: video is {codec}; it can be recorded as {allowed}")
+        if codec == "rawvideo" and context.pix_fmt not in RAW_FORMATS:
+            allowed = ", ".join(sorted(RAW_FORMATS))
+            raise DeviceError(
+                f"{self._shown_url}: raw pictures are {context.pix_fmt}; they can be recorded as {allowed}"
+            )
         if not self._size_is_known():
             raise DeviceError(f"{self._shown_url}: no key frame came that tells the size of the pictures")
         for side, want, got in (
@@ -173,12 +180,7 @@ class StreamDriver:
         if not has_time:
             text = f"{self._shown_url}: the stream carries no time stamps; pictures are stamped when they arrive"
             yield Received(events=(DeviceEvent("warning", text),))
-        packets = self._container.demux(stream)
-        while not stop.is_set():
-            packet = self._next(packets)
-            arrival_ns = time.monotonic_ns()
-            if packet.size == 0:  # PyAV marks the end of a stream by an empty packet
-                continue
+        for packet, arrival_ns in self._packets(stream, stop):
             if not has_time:
                 yield self._picture(packet, arrival_ns, arrival_ns, lost=0)
             elif packet.pts is None:
@@ -187,14 +189,28 @@ class StreamDriver:
             else:
                 yield self._stamped(packet, int(packet.pts * time_base * NS_PER_S), arrival_ns)
 
-    def _next(self, packets: "Iterator[Packet[VideoStream]]") -> "Packet[VideoStream]":
-        try:
-            return next(packets)
-        except StopIteration:
-            raise DeviceError(f"{self._shown_url}: the stream has ended") from None
-        except (av.error.FFmpegError, OSError) as error:
-            reason = _reason(error, f"no picture for {self._silence_s:g} s")
-            raise DeviceError(f"{self._shown_url}: {reason}") from error
+    def _packets(self, stream: VideoStream, stop: Event) -> "Iterator[tuple[Packet[VideoStream], int]]":
+        """Packets with their arrival until `stop` is set. Raises DeviceError."""
+        assert self._container is not None
+        packets = self._container.demux(stream)
+        last_ns = time.monotonic_ns()
+        while not stop.is_set():
+            try:
+                packet = next(packets)
+            except StopIteration:
+                raise DeviceError(f"{self._shown_url}: the stream has ended") from None
+            except BlockingIOError:  # a source that was opened without blocking has nothing yet
+                if time.monotonic_ns() - last_ns > self._silence_s * NS_PER_S:
+                    raise DeviceError(f"{self._shown_url}: no picture for {self._silence_s:g} s") from None
+                stop.wait(POLL_S)
+                packets = self._container.demux(stream)
+                continue
+            except (av.error.FFmpegError, OSError) as error:
+                reason = _reason(error, f"no picture for {self._silence_s:g} s")
+                raise DeviceError(f"{self._shown_url}: {reason}") from error
+            last_ns = time.monotonic_ns()
+            if packet.size:  # PyAV marks the end of a stream by an empty packet
+                yield packet, last_ns
 
     def _leave_out(self, size: int) -> None:
         self.bad_frames += 1
@@ -213,11 +229,11 @@ class StreamDriver:
         events = self._garbage.events(arrival_ns) + self._rhythm.events()
         if lost:
             events += (DeviceEvent("gap", f"{lost} pictures lost before this one", lost),)
-        if packet.is_keyframe or self._format.codec in INTRA_CODED:
+        is_keyframe, size = packet.is_keyframe or self._format.codec in INTRA_CODED, packet.size
+        if is_keyframe:
             self._wait_for_keyframe = False
         elif lost:
             self._wait_for_keyframe = True
-        is_keyframe, size = packet.is_keyframe, packet.size
         data = self._headers.whole(packet)
         if data is None:
             self._leave_out(size)

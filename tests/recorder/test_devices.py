@@ -304,7 +304,7 @@ def test_the_yaml_is_what_record_takes():
     source = rig.source["devices"]
     assert source["imu"] == {"driver": "xsens", "port": "/dev/serial/by-id/a", "baud": 921600}
     assert source["gnss"] == {"driver": "nmea", "port": "/dev/ttyACM0"}
-    assert source["camera"]["url"] == "/dev/v4l/by-id/b"
+    assert source["camera"]["path"] == "/dev/v4l/by-id/b"
     assert source["lidar2"] == {"driver": "robosense", "address": "192.168.1.201", "msop_port": 2369}
     assert "# UDP port 1: busy" in text
     assert "/dev/ttyUSB0, FT232R, USB 0403:6001 serial number A10, latency timer 16 ms: bytes come in bursts" in text
