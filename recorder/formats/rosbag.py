@@ -24,7 +24,7 @@ import numpy.typing as npt
 from recorder.errors import StorageError
 from recorder.formats import Exporter, FormatError
 from recorder.formats.common import chosen_poses, default_poses, epoch_ns, paired_imu
-from recorder.formats.png import Image, map_ahead
+from recorder.formats.png import Image, encode_png, map_ahead
 from recorder.formats.report import Report
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording
@@ -44,7 +44,7 @@ except ImportError as error:
 BAG2_VERSION: Literal[8] = 8
 PROGRESS_MESSAGES = 2000
 MAX_STAMP_NS = (1 << 31) * NS_PER_S  # seconds are int32 in ROS 2
-SETTINGS = {"png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]), "jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95])}
+JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95)
 
 Message = tuple[int, str, Any]  # recording time, topic, message
 
@@ -209,13 +209,13 @@ def _pictures(frames: Frames, camera: int, options: RosOptions) -> Iterator[tupl
         for image in images:
             yield "", image
         return
-    suffix, settings = SETTINGS[options.images]
 
-    def code(image: Image) -> bytes:
-        return cv2.imencode(suffix, image, settings)[1].tobytes()
-
-    for data in map_ahead(code, images):
+    for data in map_ahead(encode_png if options.images == "png" else _encode_jpeg, images):
         yield options.images, data
+
+
+def _encode_jpeg(image: Image) -> bytes:
+    return cv2.imencode(".jpg", image, JPEG)[1].tobytes()
 
 
 def _tell(report: Report, stream: str, count: int, where: str) -> None:
