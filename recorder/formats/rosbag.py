@@ -225,8 +225,14 @@ def _tell(report: Report, stream: str, count: int, where: str) -> None:
 
 def write_rosbag1(recording: Recording, out: Path, options: RosOptions, report: Report) -> None:
     """A ROS 1 bag, one file. Raises FormatError, OSError."""
+    _note_suffix(out, ".bag", report)
     with Writer1(out) as bag:
         _write(recording, _Lean(bag), 1, options, report)
+
+
+def _note_suffix(out: Path, suffix: str, report: Report) -> None:
+    if out.suffix != suffix:
+        report.note(f"programs know such a file by its name: rename it to {out.stem}{suffix}")
 
 
 class _Lean:
@@ -259,6 +265,7 @@ def write_rosbag2(recording: Recording, out: Path, options: RosOptions, report: 
 
 def write_mcap(recording: Recording, out: Path, options: RosOptions, report: Report) -> None:
     """One MCAP file with ROS 2 messages. Raises FormatError, OSError."""
+    _note_suffix(out, ".mcap", report)
     folder = out.parent / "mcap" / out.stem
     with Writer2(folder, version=BAG2_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
         _write(recording, bag, 2, options, report)
