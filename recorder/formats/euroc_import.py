@@ -7,6 +7,7 @@ stream of positions of that name; poses are brought to the IMU by the T_BS of th
 
 import heapq
 import itertools
+import re
 from collections.abc import Iterator
 from operator import itemgetter
 from pathlib import Path
@@ -24,7 +25,7 @@ from recorder.formats.kalibr import native_lens, numbers, read_yaml
 from recorder.formats.png import Image, map_ahead, read_image
 from recorder.formats.report import Report
 from recorder.formats.rotations import from_matrix, matrices
-from recorder.formats.text import count_lines, fault, read_lines, read_table
+from recorder.formats.text import BEYOND, MAX_TIME_NS, count_lines, fault, read_lines, read_table
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 LEICA = "leica0"
@@ -95,12 +96,14 @@ def _listed(index: int, camera: Path) -> Iterator[tuple[int, int, Path]]:
     last_ns: int | None = None
     for number, text in read_lines(table):
         stamp, _, name = (cell.strip() for cell in text.partition(","))
-        if not stamp.lstrip("-").isdigit() or not name:
+        if not re.fullmatch(r"-?[0-9]+", stamp) or not name:
             raise fault(table, number, "expected `time stamp in ns,file name` (is the line cut off?)")
+        if len(stamp) > 20 or abs(int(stamp)) > MAX_TIME_NS:
+            raise fault(table, number, BEYOND)
         time_ns = int(stamp)
         if last_ns is not None and time_ns <= last_ns:
             raise fault(table, number, f"{time_ns} after {last_ns}; the time stamps must ascend, sort the file")
-        if Path(name).name != name:
+        if Path(name).name != name or "\0" in name:
             raise fault(table, number, f"{name!r} is not a plain file name")
         path = camera / "data" / name
         if not path.is_file():

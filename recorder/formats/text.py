@@ -9,6 +9,7 @@ from recorder.formats import FormatError
 
 MAX_LINE_BYTES = 1 << 16
 MAX_TIME_NS = 1 << 62
+BEYOND = "a time beyond what nanoseconds in 64 bits can tell"
 
 
 def read_table(
@@ -34,7 +35,7 @@ def read_table(
         if not all(map(math.isfinite, values)):
             raise fault(path, number, "NaN or infinity, which a recording cannot hold; remove the line")
         if abs(first) > MAX_TIME_NS:
-            raise fault(path, number, f"{first} is beyond what nanoseconds in 64 bits can tell")
+            raise fault(path, number, BEYOND)
         if last is not None and (first < last or (first == last and not repeats)):
             raise fault(path, number, f"{first} after {last}; the first column must ascend, sort the file")
         last = first

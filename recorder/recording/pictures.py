@@ -23,6 +23,7 @@ LUMA_FORMATS = frozenset(("yuv420p", "yuv422p", "yuv444p", "nv12"))  # whose fir
 GRAY_FORMATS = frozenset(("gray", "yuvj420p", "yuvj422p", "yuvj444p"))
 AHEAD = 120  # so many pictures are rather decoded in vain than sought
 KEYFRAME_EVERY = 30
+MAX_FPS = 1000.0
 
 
 class VideoReader:
@@ -186,6 +187,7 @@ class LosslessEncoder:
         height, width = first.shape[:2]
         self._format = "gray" if first.ndim == 2 else "bgr24"
         name = "libx264" if first.ndim == 2 else "libx264rgb"
+        fps = min(max(fps, 1.0), MAX_FPS)
         self.video = VideoFormat("h264", width, height, fps, "gray" if first.ndim == 2 else "gbrp")
         context = av.CodecContext.create(name, "w")
         assert isinstance(context, VideoCodecContext)

@@ -1,5 +1,6 @@
 """EuRoC folders: there and back with the same numbers and pictures; folders of the dataset; faults."""
 
+import contextlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import recorder
 from recorder.formats import FormatError
@@ -215,3 +218,40 @@ def test_a_cut_picture_is_named(folder: Path, tmp_path: Path) -> None:
 def test_a_folder_of_something_else(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="is it an EuRoC folder"):
         import_(tmp_path, tmp_path / "rec", "euroc")
+
+
+FILES = ["imu0/data.csv", "cam0/data.csv", "cam0/sensor.yaml", "state_groundtruth_estimate0/data.csv", "gps0/data.csv"]
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(FILES), st.integers(0, 3000), st.one_of(st.binary(max_size=30), st.just(b"9" * 5000)))
+def test_no_bytes_break_the_import(small: Path, tmp_path: Path, name: str, at: int, data: bytes) -> None:
+    path = small / "mav0" / name
+    whole = path.read_bytes()
+    shutil.rmtree(tmp_path / "rec", ignore_errors=True)
+    try:
+        path.write_bytes(whole[:at] + data + whole[at + len(data) :])
+        with contextlib.suppress(FormatError):
+            import_(small, tmp_path / "rec", "euroc")
+    finally:
+        path.write_bytes(whole)
+
+
+@pytest.fixture(scope="module")
+def small(known: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a second of the known recording."""
+    out = tmp_path_factory.mktemp("small") / "out"
+    export(known, out, "euroc", end_s=0.5)
+    return out
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 9), (41, 61)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_pictures_of_any_size(tmp_path: Path, size: tuple[int, int], channels: int) -> None:
+    camera = tmp_path / "mav0/cam0"
+    (camera / "data").mkdir(parents=True)
+    image = np.random.default_rng(1).integers(0, 256, (*size, channels), np.uint8).squeeze(2 if channels == 1 else ())
+    cv2.imwrite(str(camera / "data/a.png"), image)
+    (camera / "data.csv").write_text("5,a.png\n")
+    import_(tmp_path, tmp_path / "rec", "euroc")
+    assert np.array_equal(recorder.open(tmp_path / "rec").frames.image(0, 0, color=channels == 3), image)
