@@ -82,7 +82,7 @@ class _Epoch(Struct):
     """Sentences with one UTC time of day.
 
     seen: how often each of the fix came, by its address; tail: the last of them.
-    is_incomplete: something came after it was taken to be over.
+    is_incomplete: something came after it was taken to be over. fix_utc_ns, fix_date_ns: time and date of its fix.
     """
 
     day_ns: int
@@ -96,7 +96,8 @@ class _Epoch(Struct):
     seen: dict[bytes, int] = {}
     tail: bytes | None = None
     is_over: bool = False
-    has_fix: bool = False
+    fix_utc_ns: int | None = None
+    fix_date_ns: int | None = None
     is_incomplete: bool = False
 
 
@@ -139,8 +140,9 @@ class NmeaDecoder:
         fixes: list[FixSample] = []
         sentences = self.scanner.feed(data)
         self.sentences += len(sentences)
+        kind_of = _KINDS.get
         for offset, body in sentences:
-            if (kind := _KINDS.get(body[2:6])) is not None:
+            if (kind := kind_of(body[2:6])) is not None:
                 self._take(offset, body, kind, fixes)
         return fixes
 
@@ -185,8 +187,8 @@ class NmeaDecoder:
         epoch = self._epoch
         if epoch is None or epoch.tail is None:
             return
-        if epoch.has_fix:
-            self._last_utc_ns = self._utc_ns(epoch)
+        if epoch.fix_utc_ns is not None:
+            self._last_utc_ns = epoch.fix_utc_ns if epoch.date_ns == epoch.fix_date_ns else self._utc_ns(epoch)
         tail = (epoch.tail, epoch.seen[epoch.tail])
         if tail == self._previous_tail:
             self._ender = tail
@@ -202,11 +204,11 @@ class NmeaDecoder:
         position = epoch.gga or (None if epoch.is_refused else epoch.gns or _position_of_rmc(epoch.rmc))
         if position is None or position.quality not in self.rules.qualities:
             return
-        epoch.has_fix = True
+        epoch.fix_utc_ns, epoch.fix_date_ns = self._utc_ns(epoch), epoch.date_ns
         self.decimals = position.decimals
         accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m, self.rules)
         fix = FixSample(
-            device_ticks=self._utc_ns(epoch),
+            device_ticks=epoch.fix_utc_ns,
             stream_offset=epoch.offset,
             latitude_deg=position.latitude_deg,
             longitude_deg=position.longitude_deg,
@@ -374,21 +376,26 @@ def _position(
 
 
 def _time_of_day_ns(text: bytes) -> int | None:
-    """Of hhmmss and any number of decimals; a leap second is 23:59:60, the same instant as 0:00 of the next day."""
-    minute_ns = _minute_of_day_ns(text[:4])
-    if minute_ns is None or not text[4:6].isdigit() or text[6:7] not in (b"", b"."):
-        return None
-    second, decimals = int(text[4:6]), text[7:]
-    if second > 60 or not (decimals.isdigit() or not decimals):
-        return None
-    return minute_ns + second * NS_PER_S + int(decimals[:9].ljust(9, b"0"))
+    """Of hhmmss and any number of decimals."""
+    second_ns, decimals_ns = _second_of_day_ns(text[:6]), _decimals_ns(text[6:])
+    return None if second_ns is None or decimals_ns is None else second_ns + decimals_ns
 
 
 @lru_cache(maxsize=8)
-def _minute_of_day_ns(text: bytes) -> int | None:
-    if not text.isdigit() or len(text) != 4 or (hour := int(text[:2])) > 23 or (minute := int(text[2:])) > 59:
+def _second_of_day_ns(text: bytes) -> int | None:
+    if len(text) != 6 or not text.isdigit():
         return None
-    return (hour * 60 + minute) * 60 * NS_PER_S
+    hour, minute, second = int(text[:2]), int(text[2:4]), int(text[4:])
+    if hour > 23 or minute > 59 or second > 60:  # a leap second is 23:59:60, the same instant as 0:00 of the next day
+        return None
+    return (hour * 3600 + minute * 60 + second) * NS_PER_S
+
+
+@lru_cache(maxsize=64)
+def _decimals_ns(text: bytes) -> int | None:
+    if text in (b"", b"."):
+        return 0
+    return int(text[1:10].ljust(9, b"0")) if text[:1] == b"." and text[1:].isdigit() else None
 
 
 @lru_cache(maxsize=8)
