@@ -30,12 +30,13 @@ def port(tmp_path) -> Iterator[str]:
     """The pty of a simulated receiver."""
     rig = tmp_path / "rig.yaml"
     rig.write_text("simulate: {trajectory: brisk}\ndevices: {gnss: {driver: nmea, baud: 115200, rate_hz: 10}}\n")
-    with subprocess.Popen([sys.executable, "-m", "simulated_devices", str(rig)], stdout=subprocess.PIPE, text=True) as p:
+    command = [sys.executable, "-m", "simulated_devices", str(rig)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as simulation:
         try:
-            document = "".join(iter(p.stdout.readline, "...\n"))
+            document = "".join(iter(simulation.stdout.readline, "...\n"))
             yield os.path.realpath(yaml.safe_load(document)["devices"]["gnss"]["port"])
         finally:
-            p.terminate()
+            simulation.terminate()
 
 
 @pytest.fixture
