@@ -65,12 +65,21 @@ class StepCounter:
     period_ticks: float | None = None
     lost: int = 0
     _last: int | None = None
+    _back: int = 0
     _steps: list[int] = field(default_factory=list)
 
     def note(self, ticks: int) -> None:
         """A message with this time has come."""
-        last, self._last = self._last, ticks
-        if last is None or (step := ticks - last) <= 0:
+        if self._last is None:
+            self._last = ticks
+            return
+        step = ticks - self._last
+        if step <= 0:
+            self._back += step < 0
+            if self._back < RESTART_MESSAGES:  # else it is no stale message, the device's clock began anew
+                return
+        self._last, self._back = ticks, 0
+        if step <= 0:
             return
         if self.period_ticks is None:
             self._steps.append(step)
@@ -81,5 +90,32 @@ class StepCounter:
             self.lost += round(step / self.period_ticks) - 1
 
 
+@dataclass(slots=True)
+class SequenceCounter:
+    """Counts the messages that are missing in a counter of so many bits.
+
+    A message from before the last one is stale or repeated, and not counted; several in a row are a device that began
+    anew.
+    """
+
+    bits: int
+    lost: int = 0
+    _last: int | None = None
+    _back: int = 0
+
+    def note(self, count: int, *, is_from_before: bool = False) -> bool:
+        """A message with this number has come. is_from_before: its time says so. Gives whether it was a new one."""
+        missing = 0 if self._last is None else (count - self._last - 1) & ((1 << self.bits) - 1)
+        if is_from_before or missing >= 1 << (self.bits - 1):
+            self._back += count != self._last
+            if self._back < RESTART_MESSAGES:
+                return False
+            missing = 0
+        self.lost += missing
+        self._last, self._back = count, 0
+        return True
+
+
+RESTART_MESSAGES = 3
 LEARNED_STEPS = 20
 MAX_LOST = 100_000  # a longer step is a clock that was set

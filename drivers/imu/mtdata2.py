@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any
 
-from drivers.framing import Framer
+from drivers.framing import Framer, SequenceCounter
 from drivers.samples import ImuSample, Vector
 
 MTDATA2 = 0x36
@@ -107,14 +107,18 @@ class Mtdata2Decoder:
     """
 
     magnetic_field_ut: float = 50.0
-    lost_messages: int = 0
     frames: int = 0
     replies: deque[Message] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
     starts: list[int] = field(default_factory=list)
     framer: Framer = field(default_factory=xbus_framer)
     _shapes: "dict[int, _Shape]" = field(default_factory=dict)
-    _counter: int | None = None
+    _counter: SequenceCounter = field(default_factory=lambda: SequenceCounter(16))
     _ticks: int | None = None
+
+    @property
+    def lost_messages(self) -> int:
+        """Messages missing in the packet counter."""
+        return self._counter.lost
 
     @property
     def bad_frames(self) -> int:
@@ -146,18 +150,13 @@ class Mtdata2Decoder:
         return samples
 
     def _count_lost(self, sample: ImuSample, is_inertial: bool) -> None:
-        restarted = False
-        if is_inertial and sample.device_ticks is not None:
-            if self._ticks is not None:
-                restarted = (sample.device_ticks - self._ticks) & 0xFFFFFFFF >= 1 << 31
-            self._ticks = sample.device_ticks
-        if sample.sequence is None:
-            return
-        if self._counter is not None and not restarted:
-            lost = (sample.sequence - self._counter - 1) & 0xFFFF
-            if lost < 1 << 15:  # more is a step back: a device that started anew, or a repeated packet
-                self.lost_messages += lost
-        self._counter = sample.sequence
+        ticks = sample.device_ticks if is_inertial else None
+        is_from_before = False
+        if ticks is not None and self._ticks is not None:
+            is_from_before = (ticks - self._ticks) & 0xFFFFFFFF >= 1 << 31
+        is_new = sample.sequence is None or self._counter.note(sample.sequence, is_from_before=is_from_before)
+        if is_new and ticks is not None:
+            self._ticks = ticks
 
 
 def decode_mtdata2(

@@ -7,7 +7,7 @@ import re
 import struct
 from dataclasses import dataclass, field
 
-from drivers.framing import Framer
+from drivers.framing import Framer, SequenceCounter
 from drivers.samples import ImuSample
 
 FRAME_BYTES = 19
@@ -34,10 +34,14 @@ class RvcDecoder:
     """
 
     frames: int = 0
-    lost_messages: int = 0
     starts: list[int] = field(default_factory=list)
     framer: Framer = field(default_factory=lambda: Framer(_START, _length))
-    _index: int | None = None
+    _counter: SequenceCounter = field(default_factory=lambda: SequenceCounter(8))
+
+    @property
+    def lost_messages(self) -> int:
+        """Messages missing in the index, which tells up to 127 in a row."""
+        return self._counter.lost
 
     @property
     def bad_frames(self) -> int:
@@ -56,9 +60,7 @@ class RvcDecoder:
         for start, frame in self.framer.feed(data):
             self.frames += 1
             index, _, _, _, x, y, z, _ = _BODY.unpack_from(frame, 2)
-            if self._index is not None and index != self._index:
-                self.lost_messages += (index - self._index - 1) & 0xFF
-            self._index = index
+            self._counter.note(index)
             accel_m_s2 = (x * M_S2_PER_MG, y * M_S2_PER_MG, z * M_S2_PER_MG)
             samples.append(ImuSample(index, index, accel_m_s2, None))
             self.starts.append(start)

@@ -137,6 +137,13 @@ def test_lost_messages_by_the_time() -> None:
     assert decoder.lost_messages == 3
 
 
+def test_a_stale_message_or_a_restart_is_no_loss() -> None:
+    decoder = VectornavDecoder()
+    for number in [*range(30), 20, 30, 31, *range(40)]:
+        decoder.feed(measurement(number * 10_000_000))
+    assert decoder.lost_messages == 0
+
+
 STREAM = (
     (DATA / "F00294").read_bytes()[:3000] + b"\xfa\x01\x21" + LINE + b"$VNIM" + COMPENSATED + b"\xfa" + UNCOMPENSATED
 )

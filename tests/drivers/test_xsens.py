@@ -164,6 +164,8 @@ def test_every_changed_bit_is_noticed() -> None:
         pytest.param([(60000, 9000), (5, 125)], 0, id="restart"),
         pytest.param([(7, 2**32 - 1), (9, 49)], 1, id="time-wraps"),
         pytest.param([(7, 100), (7, 100), (8, 125)], 0, id="repeated"),
+        pytest.param([(7, 100), (8, 125), (3, 25), (9, 150), (11, 200)], 1, id="stale"),
+        pytest.param([(60000, 9000), (5, 125), (6, 150), (7, 175), (9, 225)], 1, id="hole-after-a-restart"),
     ],
 )
 def test_lost_messages(counters_and_ticks: list[tuple[int, int]], lost: int) -> None:
