@@ -2,7 +2,7 @@
 
 Three steps. The scanner finds sentences with a good checksum among whatever else is on the line. The sentences of one
 epoch, known by their UTC time of day and in no particular order, are gathered. An epoch that is over becomes a fix:
-position from GGA, accuracy from GST, date from RMC or ZDA.
+position from GGA, accuracy from GST or from the dilutions in GGA and GSA, date from RMC or ZDA.
 """
 
 import math
@@ -24,6 +24,7 @@ QUALITY_OF_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 
 UERE_M = {1: 5.0, 2: 2.5, 3: 2.5, 4: 0.02, 5: 0.4, 6: 20.0, 9: 2.5}
 """Horizontal error, one sigma, for a dilution of 1, by quality: rough, from what receivers with GST say."""
 VERTICAL_PER_HORIZONTAL = 2.0
+VDOP_AGE_NS = 2_000_000_000
 MAX_HDOP = 99.0  # receivers send 99.9 for "unknown"
 
 NS_PER_S = 1_000_000_000
@@ -43,6 +44,7 @@ class FixRules:
     qualities: those to take (6 dead reckoning, 7 manual, 8 simulator are not by default). is_ellipsoidal: altitude
     above the ellipsoid instead of mean sea level, None where the undulation is not sent. uere_m: horizontal error, one
     sigma, for a dilution of 1, by quality; a quality that is not in it has no accuracy without GST.
+    vertical_per_horizontal: of the errors, where neither GST nor the vertical dilution (GSA) is sent.
     """
 
     qualities: frozenset[int] = EMITTED_QUALITIES
@@ -122,6 +124,7 @@ class NmeaDecoder:
     _last_utc_ns: int | None = None
     _ender: tuple[bytes, int] | None = None
     _previous_tail: tuple[bytes, int] | None = None
+    _vdop: tuple[int, float | None] | None = None
     _time_text: bytes | None = None
     _time_ns: int | None = None
 
@@ -154,6 +157,9 @@ class NmeaDecoder:
 
     def _take(self, offset: int, body: bytes, kind: "_Kind", fixes: list[FixSample]) -> None:
         time_field, gather, is_of_fix = kind
+        if time_field == NO_TIME:
+            self._take_gsa(body)
+            return
         fields = body.split(b",")
         if time_field >= len(fields):
             return
@@ -178,6 +184,15 @@ class NmeaDecoder:
             epoch.is_incomplete = True
         elif self._ender is not None and self._ender == (address, count):
             self._close(fixes)
+
+    def _take_gsa(self, body: bytes) -> None:
+        """The dilutions, of the epoch that is open or was just closed; where there is GST nobody asks for them."""
+        epoch = self._epoch
+        if epoch is None or epoch.sigmas_m is not None:
+            return
+        fields = body.split(b",")
+        if len(fields) in (18, 19):  # NMEA 4.1 adds the system
+            self._vdop = (epoch.day_ns, _number(fields[17], 0, MAX_HDOP))
 
     def _learn(self) -> None:
         """What a whole epoch tells about the next: how the cycle ends, and a date that came after its fix was given.
@@ -206,7 +221,7 @@ class NmeaDecoder:
             return
         epoch.fix_utc_ns, epoch.fix_date_ns = self._utc_ns(epoch), epoch.date_ns
         self.decimals = position.decimals
-        accuracy_m, vertical_accuracy_m, source = _accuracy(position, epoch.sigmas_m, self.rules)
+        accuracy_m, vertical_accuracy_m, source = self._accuracy(epoch, position)
         fix = FixSample(
             device_ticks=epoch.fix_utc_ns,
             stream_offset=epoch.offset,
@@ -223,6 +238,18 @@ class NmeaDecoder:
             correction_age_s=position.correction_age_s,
         )
         fixes.append(fix)
+
+    def _accuracy(self, epoch: _Epoch, position: _Position) -> tuple[float | None, float | None, Source]:
+        """Horizontal, vertical and where they are from. A vertical dilution serves until it is two seconds old."""
+        if epoch.sigmas_m is not None:
+            return *epoch.sigmas_m, "gst"
+        uere_m = self.rules.uere_m.get(position.quality)
+        if not position.hdop or uere_m is None:
+            return None, None, "none"
+        accuracy_m = position.hdop * uere_m
+        if self._vdop is not None and self._vdop[1] and 0 <= epoch.day_ns - self._vdop[0] <= VDOP_AGE_NS:
+            return accuracy_m, self._vdop[1] * uere_m, "dop"
+        return accuracy_m, accuracy_m * self.rules.vertical_per_horizontal, "dop"
 
     def _utc_ns(self, epoch: _Epoch) -> int:
         """UTC of an epoch: with the date it was sent with, else on the day that brings it nearest to the last one."""
@@ -294,8 +321,11 @@ def _gather_zda(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
         epoch.date_ns = _date_ns(fields[2], fields[3], fields[4])
 
 
+NO_TIME = 0
+
+
 class _Kind(NamedTuple):
-    """A kind of sentence: which field is its time, and what is taken from it.
+    """A kind of sentence: which field is its time (NO_TIME: GSA), and what is taken from it.
 
     is_of_fix: it belongs to each fix. ZDA brings a date only, often once a second: it must neither end nor spoil an
     epoch.
@@ -315,18 +345,8 @@ _KINDS = {
     b"GBS,": _Kind(1),
     b"GRS,": _Kind(1),
     b"GLL,": _Kind(5),
+    b"GSA,": _Kind(NO_TIME),
 }
-
-
-def _accuracy(
-    position: _Position, sigmas_m: tuple[float, float | None] | None, rules: FixRules
-) -> tuple[float | None, float | None, Source]:
-    if sigmas_m is not None:
-        return *sigmas_m, "gst"
-    if not position.hdop or position.quality not in rules.uere_m:
-        return None, None, "none"
-    accuracy_m = position.hdop * rules.uere_m[position.quality]
-    return accuracy_m, accuracy_m * rules.vertical_per_horizontal, "dop"
 
 
 @lru_cache(maxsize=256)  # most numbers of an epoch are those of the one before

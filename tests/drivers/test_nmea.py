@@ -136,6 +136,18 @@ def test_accuracy_without_gst_is_by_dilution() -> None:
     assert (fix.accuracy_m, fix.vertical_accuracy_m, fix.accuracy_source) == (4.0, 8.0, "dop")
 
 
+def test_vertical_accuracy_is_by_the_vertical_dilution_where_it_is_sent() -> None:
+    gsa = sentence("GNGSA,A,3,01,02,,,,,,,,,,,1.5,0.80,1.20,1")
+    first, second, later = decode(gga() + gsa + gga("120001.00") + gga("120004.00"))
+    assert (first.accuracy_m, first.vertical_accuracy_m, first.accuracy_source) == (4.0, 6.0, "dop")
+    assert second.vertical_accuracy_m == 6.0  # it is a second old
+    assert later.vertical_accuracy_m == 8.0
+    (unknown,) = decode(gga() + sentence("GNGSA,A,1,,,,,,,,,,,,,99.9,99.9,99.9"))
+    assert unknown.vertical_accuracy_m == 8.0
+    (short,) = decode(gga() + sentence("GNGSA,A,3,1.5,0.80,1.20"))
+    assert short.vertical_accuracy_m == 8.0
+
+
 @pytest.mark.parametrize(("quality", "fixes"), [(0, 0), (1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (6, 0), (7, 0), (8, 0)])
 def test_quality_decides(quality: int, fixes: int) -> None:
     assert len(decode(gga(quality=quality) + rmc())) == fixes
