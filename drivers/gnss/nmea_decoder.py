@@ -9,12 +9,11 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from functools import lru_cache
 from typing import Literal, NamedTuple
 
 from msgspec import Struct
 
+from drivers.gnss.nmea_fields import NS_PER_S, date_ns, integer, number, short_date_ns, time_of_day_ns
 from drivers.gnss.nmea_scanner import SentenceScanner
 from drivers.samples import FixSample
 
@@ -27,11 +26,9 @@ VERTICAL_PER_HORIZONTAL = 2.0
 VDOP_AGE_NS = 2_000_000_000
 MAX_HDOP = 99.0  # receivers send 99.9 for "unknown"
 
-NS_PER_S = 1_000_000_000
 DAY_NS = 86_400 * NS_PER_S
 ROLLOVER_NS = 1024 * 7 * DAY_NS
 
-_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)")
 _LATITUDE_LONGITUDE = re.compile(rb"(\d{1,2})(\d\d(?:\.(\d*))?),([NS]),(\d{1,3})(\d\d(?:\.\d*)?),([EW])")
 
 Source = Literal["gst", "dop", "none"]
@@ -165,7 +162,7 @@ class NmeaDecoder:
             return
         if fields[time_field] != self._time_text:
             self._time_text = fields[time_field]
-            self._time_ns = _time_of_day_ns(self._time_text)
+            self._time_ns = time_of_day_ns(self._time_text)
         if self._time_ns is None:
             return
         epoch = self._epoch
@@ -192,7 +189,7 @@ class NmeaDecoder:
             return
         fields = body.split(b",")
         if len(fields) in (18, 19):  # NMEA 4.1 adds the system
-            self._vdop = (epoch.day_ns, _number(fields[17], 0, MAX_HDOP))
+            self._vdop = (epoch.day_ns, number(fields[17], 0, MAX_HDOP))
 
     def _learn(self) -> None:
         """What a whole epoch tells about the next: how the cycle ends, and a date that came after its fix was given.
@@ -263,15 +260,15 @@ class NmeaDecoder:
 
 
 def _gather_gga(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
-    quality = _integer(fields[6]) if len(fields) >= 12 else None
+    quality = integer(fields[6]) if len(fields) >= 12 else None
     if quality is None:  # receivers that leave it empty say with RMC whether the position is good
         return
     if quality not in rules.qualities:
         epoch.is_refused = True
         return
-    age_s = _number(fields[13], 0, 1e6) if len(fields) > 13 else None
-    altitude_m = _number(fields[9], -2_000, 100_000) if fields[10] in (b"M", b"") else None
-    undulation_m = _number(fields[11], -200, 200)
+    age_s = number(fields[13], 0, 1e6) if len(fields) > 13 else None
+    altitude_m = number(fields[9], -2_000, 100_000) if fields[10] in (b"M", b"") else None
+    undulation_m = number(fields[11], -200, 200)
     position = _position(fields, 2, quality, altitude_m, undulation_m, fields[7], fields[8], age_s)
     if position is not None and (epoch.gga is None or position.is_better_than(epoch.gga)):
         epoch.gga = position
@@ -285,8 +282,8 @@ def _gather_gns(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if not qualities:
         return
     quality = min(qualities, key=QUALITY_RANK.index)
-    age_s = _number(fields[11], 0, 1e6) if len(fields) > 11 else None
-    altitude_m, undulation_m = _number(fields[9], -2_000, 100_000), _number(fields[10], -200, 200)
+    age_s = number(fields[11], 0, 1e6) if len(fields) > 11 else None
+    altitude_m, undulation_m = number(fields[9], -2_000, 100_000), number(fields[10], -200, 200)
     position = _position(fields, 2, quality, altitude_m, undulation_m, fields[7], fields[8], age_s)
     if position is not None and (epoch.gns is None or position.is_better_than(epoch.gns)):
         epoch.gns = position
@@ -295,7 +292,7 @@ def _gather_gns(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
 def _gather_rmc(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if len(fields) < 10 or fields[2] != b"A":  # a void sentence may carry any date
         return
-    epoch.date_ns = _short_date_ns(fields[9])
+    epoch.date_ns = short_date_ns(fields[9])
     if fields[3] and fields[5]:
         epoch.rmc = fields
 
@@ -311,14 +308,14 @@ def _position_of_rmc(fields: list[bytes] | None) -> _Position | None:
 def _gather_gst(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if len(fields) < 9:
         return
-    latitude_m, longitude_m = _number(fields[6], 0, 1e6), _number(fields[7], 0, 1e6)
+    latitude_m, longitude_m = number(fields[6], 0, 1e6), number(fields[7], 0, 1e6)
     if latitude_m is not None and longitude_m is not None and latitude_m + longitude_m > 0:
-        epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), _number(fields[8], 0, 1e6))
+        epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), number(fields[8], 0, 1e6))
 
 
 def _gather_zda(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if len(fields) >= 5 and epoch.date_ns is None:
-        epoch.date_ns = _date_ns(fields[2], fields[3], fields[4])
+        epoch.date_ns = date_ns(fields[2], fields[3], fields[4])
 
 
 NO_TIME = 0
@@ -349,19 +346,6 @@ _KINDS = {
 }
 
 
-@lru_cache(maxsize=256)  # most numbers of an epoch are those of the one before
-def _number(text: bytes, low: float, high: float) -> float | None:
-    if not _NUMBER.fullmatch(text):
-        return None
-    value = float(text)
-    return value if low <= value <= high else None
-
-
-@lru_cache(maxsize=64)
-def _integer(text: bytes) -> int | None:
-    return int(text) if text.isdigit() and len(text) <= 4 else None
-
-
 def _position(
     fields: list[bytes],
     place: int,
@@ -388,51 +372,11 @@ def _position(
         longitude_deg if east_west == b"E" else -longitude_deg,
         altitude_m,
         undulation_m,
-        _integer(satellites),
-        _number(hdop, 0, MAX_HDOP),
+        integer(satellites),
+        number(hdop, 0, MAX_HDOP),
         correction_age_s,
         len(decimals or b""),
     )
-
-
-def _time_of_day_ns(text: bytes) -> int | None:
-    """Of hhmmss and any number of decimals."""
-    second_ns, decimals_ns = _second_of_day_ns(text[:6]), _decimals_ns(text[6:])
-    return None if second_ns is None or decimals_ns is None else second_ns + decimals_ns
-
-
-@lru_cache(maxsize=8)
-def _second_of_day_ns(text: bytes) -> int | None:
-    if len(text) != 6 or not text.isdigit():
-        return None
-    hour, minute, second = int(text[:2]), int(text[2:4]), int(text[4:])
-    if hour > 23 or minute > 59 or second > 60:  # a leap second is 23:59:60, the same instant as 0:00 of the next day
-        return None
-    return (hour * 3600 + minute * 60 + second) * NS_PER_S
-
-
-@lru_cache(maxsize=64)
-def _decimals_ns(text: bytes) -> int | None:
-    if text in (b"", b"."):
-        return 0
-    return int(text[1:10].ljust(9, b"0")) if text[:1] == b"." and text[1:].isdigit() else None
-
-
-@lru_cache(maxsize=8)
-def _short_date_ns(text: bytes) -> int | None:
-    return _date_ns(text[:2], text[2:4], text[4:])
-
-
-@lru_cache(maxsize=8)
-def _date_ns(day: bytes, month: bytes, year: bytes) -> int | None:
-    if not (day.isdigit() and month.isdigit() and year.isdigit() and len(year) in (2, 4)):
-        return None
-    full_year = int(year) if len(year) == 4 else int(year) + (2000 if int(year) < 80 else 1900)
-    try:
-        date = datetime(full_year, int(month), int(day), tzinfo=UTC)
-    except ValueError:
-        return None
-    return int(date.timestamp()) * NS_PER_S
 
 
 def _rounded(value: int, unit: int) -> int:
