@@ -216,7 +216,7 @@ class RobosenseDriver:
             chunks = link.read(0.1)
             now_ns = self.links.monotonic_ns()
             received = self._take(chunks, now_ns)
-            if received.chunks or received.events:
+            if received.chunks or received.samples or received.events:
                 yield received
             if self._last_arrival_ns != last_arrival_ns:
                 last_packet_ns, last_arrival_ns = now_ns, self._last_arrival_ns

@@ -223,6 +223,35 @@ def test_kernel_drops_and_gaps_add_up(network: Network, monkeypatch: pytest.Monk
     assert dropped + lost + sum(scan.packets_received for scan in scans_of(items)) == 4 * 40 + 25
 
 
+def test_loss_with_the_buffer_of_the_systems_default_is_told_exactly(
+    network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default_bytes = int(Path("/proc/sys/net/core/rmem_default").read_text())
+    monkeypatch.setattr(links, "RECEIVE_BUFFER_BYTES", default_bytes // 2)  # the kernel doubles what is asked for
+    sent = [one for index in range(6) for one in frame(index, 630)]
+    network.at_connect = lambda: network.send(*sent[:50])
+    driver = network.driver()
+    driver.connect()
+    stop = Event()
+    reading = driver.read(stop)
+    items = collect(reading, lambda items: chunk_count(items) == 50)
+    begin = 50
+    for count in (900, 20, 1000, 400, 1200, 20, 20, 20):  # hundreds more than fit in, then some that are read in time
+        network.send(*sent[begin : begin + count])
+        begin += count
+        came = collect(reading, lambda items: 0 < chunk_count(items) < links.DATAGRAMS_PER_READ)
+        items += came
+        assert chunk_count(came) == count or count > 100
+    stop.set()
+    items += list(reading)
+    driver.close()
+    received, read = sum(scan.packets_received for scan in scans_of(items)), chunk_count(items)
+    dropped = sum(event.count for event in events_of(items, "drop"))
+    assert received == read
+    assert dropped == begin - received > 1000
+    assert events_of(items, "gap") == []
+
+
 def test_two_lidars_on_one_port_are_told_once(network: Network) -> None:
     network.at_connect = lambda: network.send(*frame(0, 40))
     driver = network.driver()
@@ -265,6 +294,9 @@ def test_silence_gives_the_last_frame_then_the_error(network: Network, monkeypat
     with pytest.raises(DeviceError, match="no measurement packet"):
         items.extend(driver.read(Event()))
     driver.close()
+    pairs = [sample for item in items for _, sample in item.samples if isinstance(sample, ClockPairs)]
+    assert sum(pair.ticks.size for pair in pairs) == 20
+    assert [scan.packets_received for scan in scans_of(items)] == [20]
     network.at_connect = lambda: network.send(*frame(9, 40))
     driver.connect()  # and it is taken up again
     driver.close()
