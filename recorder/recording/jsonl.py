@@ -161,9 +161,12 @@ def lidar_line(time_ns: int, model: str, data_file: str, scan: ScanSample) -> by
         "model": model,
         "dataFile": data_file,
         "points": len(scan.points),
+        "pointsExpected": scan.points_expected,
         "packetsExpected": scan.packets_expected,
         "packetsReceived": scan.packets_received,
     }
+    if not scan.points_expected:
+        del lidar["pointsExpected"]
     if scan.is_partial:
         lidar["partial"] = True
     return encode_json({"lidar": lidar, "time": time_ns / NS_PER_S})

@@ -43,7 +43,8 @@ def helios(lasers: int) -> list[bytes]:
     for laser in range(lasers, 32):
         difop[468 + 3 * laser : 471 + 3 * laser] = difop[564 + 3 * laser : 567 + 3 * laser] = b"\xff\xff\xff"
     found = [bytes(difop)]
-    for number, datagram in enumerate(one for one in golden("rs16_single") if not one.startswith(DIFOP_MAGIC)):
+    packets = [one for one in golden("rs16_single") if not one.startswith(DIFOP_MAGIC)]
+    for number, datagram in enumerate(20 * packets):
         packet = bytearray(datagram)
         packet[:8] = bytes.fromhex("55AA055A00000000")
         packet[20:30] = (1_700_000_000).to_bytes(6) + (number * 1333).to_bytes(4)
