@@ -22,10 +22,14 @@ from recorder.recording.manifest import DeviceSummary, StreamSummary
 from recorder.recording.writer import RecordingWriter, new_manifest
 from simulated_devices.bno08x_rvc import Bno08xRvcSettings
 from simulated_devices.camera import ClientStream, PictureEncoder
+from simulated_devices.lidar_scan import World
 from simulated_devices.nmea import ORIGIN, SIGMA_M
 from simulated_devices.pose import quaternion
 from simulated_devices.rig import IMUS, Cast, calibration, simulate_settings
-from simulated_devices.robosense import IMU_FROM_LIDAR
+from simulated_devices.robosense import IMU_FROM_LIDAR, make_lidar
+from simulated_devices.robosense_mems import M1Lidar, VectorLidar
+from simulated_devices.robosense_packets import Mode
+from simulated_devices.robosense_spinning import SpinningLidar
 from simulated_devices.sampling import SampleGrid
 from simulated_devices.scene import CameraRenderer, M1Scanner, PinholeCamera
 from simulated_devices.timing import SECOND_NS, Int64Array, random_for
@@ -36,6 +40,7 @@ TAKE_START_NS = WORLD_START_NS - SECOND_NS  # a take begins about so long before
 TWIN_UTC_NS = 1_767_225_600 * SECOND_NS  # a date, so that the same seed gives the same files
 RADIUS_UNIT_M = np.float32(0.005)
 ANGLE_ZERO = 32768
+LIDAR_NAMES = {"airy": "Airy", "helios32": "Helios 32", "helios16p": "Helios 16P"}
 BATCH = 100
 PROGRESS_NS = 5 * SECOND_NS
 
@@ -59,8 +64,8 @@ class Twin:
         for name, entry in entries.items():
             if entry["driver"] == "robosense-imu":
                 raise ConfigError(f"devices.{name}: an ideal twin cannot be written of a lidar's IMU")
-            if entry["driver"] == "robosense" and (entry.get("model", "m1") != "m1" or name in self._cast.lidars):
-                raise ConfigError(f"devices.{name}: of lidars, an ideal twin can only be written of an m1 as it comes")
+            if entry["driver"] == "robosense" and name in self._cast.lidars:
+                raise ConfigError(f"devices.{name}: an ideal twin can only be written of a lidar as it comes")
         self._duration_ns = round(duration_s * SECOND_NS)
         self.entries: dict[str, dict[str, Any]] = entries
         self.cameras = [name for name, entry in entries.items() if entry["driver"] == "stream"]
@@ -142,17 +147,39 @@ class Twin:
                 yield time_ns, order, name, sample
 
     def _lidar(self, order: int, name: str) -> Iterator[Item]:
-        scanner = M1Scanner(self._cast.stage.seed_for("lidar", name))
+        model = self.entries[name].get("model", "m1")
+        world = World(self._cast.room, self._cast.trajectory, IMU_FROM_LIDAR, self._cast.stage.seed_for("lidar", name))
+        lidar = make_lidar(model, world, Mode(dual=False, clock="free"))
+        packets = len(lidar.packet_offset_ns)
+        scan_model = f"RoboSense {LIDAR_NAMES.get(model, model.upper())} XYZIRT"
+        scanner = M1Scanner(world.seed)
         for times_ns in self._times(name, 10):
             for start_ns in times_ns.tolist():
                 frame = round(start_ns * 10 / SECOND_NS)
                 start_s = float(_world_s(np.array([start_ns]))[0])
-                radius, intensity = scanner.scan(self._cast.room, self._cast.trajectory, start_s, IMU_FROM_LIDAR, frame)
-                points = _points(scanner, start_ns, radius, intensity)
+                if isinstance(lidar, M1Lidar):
+                    scan = scanner.scan(world.room, world.trajectory, start_s, IMU_FROM_LIDAR, frame)
+                    points = _points(scanner, start_ns, *scan)
+                else:
+                    points = _cast_points(lidar, start_ns, start_s, frame)
                 if len(points):
-                    last_ns = round(float(points["timestamp"][-1]) * SECOND_NS)
-                    packets = len(radius)
-                    yield last_ns, order, name, ScanSample(points, start_ns, last_ns, packets, packets, 0, False)
+                    last_ns = round(float(points["timestamp"].max()) * SECOND_NS)
+                    sample = ScanSample(points, start_ns, last_ns, packets, packets, 0, False, scan_model)
+                    yield last_ns, order, name, sample
+
+
+def _cast_points(
+    lidar: VectorLidar | SpinningLidar, start_ns: int, start_s: float, frame: int
+) -> np.ndarray[Any, np.dtype[np.void]]:
+    """The points of a frame that returned, (n,) POINT_DTYPE, timestamp in seconds of recording time."""
+    time_s, place_m, intensity = lidar.caster.points(start_s, frame)
+    points = np.zeros(intensity.shape, dtype=POINT_DTYPE)
+    points["x"], points["y"], points["z"] = np.moveaxis(place_m, -1, 0)
+    points["intensity"] = intensity
+    points["ring"] = lidar.rings
+    points["timestamp"] = (start_ns * 1e-9 + time_s)[:, None]
+    returned: np.ndarray[Any, np.dtype[np.void]] = points[np.isfinite(points["x"])]
+    return returned
 
 
 def _world_s(times_ns: Int64Array) -> np.ndarray[Any, np.dtype[np.float64]]:

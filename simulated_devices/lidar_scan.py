@@ -46,8 +46,8 @@ class RayCaster:
 
     def __init__(self, world: World, rays: Rays, *, dual: bool) -> None:
         """dual: two returns a ray, the nearer first; they differ where dust stands in the way."""
+        self.rays = rays
         self._world = world
-        self._rays = rays
         self._dual = dual
         span_s = float(rays.time_s[-1]) + 1e-9
         self._knots_s = np.linspace(0.0, span_s, KNOTS)
@@ -63,8 +63,8 @@ class RayCaster:
     def cast(self, start_s: float, index: int) -> tuple[Float32Array, Image]:
         """Distance in metres (0: no return) and intensity, (returns, m, c). What is random follows from `index`."""
         rotation, origin = self._poses(start_s)
-        origin += np.einsum("nij,nj->ni", rotation, self._rays.lens_m)
-        distance, gray = cast_rays(self._world.room, rotation, origin, list(self._rays.directions))
+        origin += np.einsum("nij,nj->ni", rotation, self.rays.lens_m)
+        distance, gray = cast_rays(self._world.room, rotation, origin, list(self.rays.directions))
         size = distance.size
         starts = np.random.default_rng([self._world.seed, abs(index)]).integers(0, size, 3)
         noise = self._noise_m[starts[0] : starts[0] + size].reshape(distance.shape)
@@ -76,6 +76,16 @@ class RayCaster:
             return distance[None], gray[None]
         nearer = np.where(dust, np.float32(0.6) * distance, distance)
         return np.stack((nearer, distance)), np.stack((np.where(dust, DUST_GRAY, gray).astype(np.uint8), gray))
+
+    def points(self, start_s: float, index: int) -> tuple[FloatArray, Float32Array, Image]:
+        """Where the last return of each ray is that has one, without what packets round: x, y, z are (m, c, 3).
+
+        Gives times from the frame's start (m,), places in metres (NaN: no return) and intensities (m, c).
+        """
+        distance, intensity = self.cast(start_s, index)
+        distance_m = np.where(distance[-1] > 0, distance[-1], np.float32(np.nan))
+        place_m = np.stack([axis * distance_m for axis in self.rays.directions], axis=-1) + self.rays.lens_m[:, None]
+        return self.rays.time_s, place_m, intensity[-1]
 
     def _poses(self, start_s: float) -> tuple[Float32Array, Float32Array]:
         """world_from_lidar at each shot, linear between the knots: rotations (m, 3, 3) and origins (m, 3)."""

@@ -90,7 +90,7 @@ class RobosenseSimulator:
         self._settings = settings
         self._stage = stage
         mode = Mode(setup.returns == "dual", setup.time)
-        self.lidar = make_lidar(
+        self.lidar: Lidar = make_lidar(
             settings.model, World(room, trajectory, IMU_FROM_LIDAR, stage.seed_for("lidar", name)), mode
         )
         self._sender = DatagramSender(name, stage, faults)
@@ -173,7 +173,7 @@ class RobosenseSimulator:
         return Motion(tuple(accel[0].tolist()), tuple(gyro[0].tolist()))
 
 
-def make_lidar(model: ModelKey, world: World, mode: Mode) -> Lidar:
+def make_lidar(model: ModelKey, world: World, mode: Mode) -> M1Lidar | VectorLidar | SpinningLidar:
     """The lidar of that model."""
     if model == "m1":
         return M1Lidar(world, mode)

@@ -192,7 +192,8 @@ class VectorLidar(_Mems):
         shots = model.packets * model.blocks
         time_s = np.arange(shots, dtype=np.float64) * (FRAME_NS * 1e-9 / shots)
         rays = Rays(time_s, directions, np.zeros((shots, 3), np.float32))
-        self._caster = RayCaster(world, rays, dual=mode.dual)
+        self.caster = RayCaster(world, rays, dual=mode.dual)
+        self.rings = np.arange(model.channels)
         shape = (model.packets, model.blocks, model.channels)
         wire = {
             axis: np.clip(np.rint(values * VECTOR_ONE), 1 - VECTOR_ONE, VECTOR_ONE - 1).astype(np.int16).reshape(shape)
@@ -203,7 +204,7 @@ class VectorLidar(_Mems):
     def frame(self, time_us: Int64Array, start_s: float, index: int) -> Packets:
         """The packets of a frame."""
         model = self._model
-        distance_m, intensity = self._caster.cast(start_s, index)
+        distance_m, intensity = self.caster.cast(start_s, index)
         radius = as_radius(distance_m, M1_RADIUS_UNIT_M)
         radius[radius == 0] = model.no_return
         shape = (len(radius), model.packets, model.blocks, model.channels)

@@ -124,7 +124,8 @@ class SpinningLidar:
         self._vertical = np.clip(vertical + generator.integers(-spread, spread + 1, lasers), -9000, 9000)
         self._horizontal = spread * generator.integers(-50, 51, lasers)
         self._azimuth = np.arange(model.columns) * (TURN // model.columns)
-        self._caster = RayCaster(world, self._rays(), dual=mode.dual)
+        self.caster = RayCaster(world, self._rays(), dual=mode.dual)
+        self.rings = self._vertical.argsort(kind="stable").argsort(kind="stable")[np.array(model.lasers)]
         self._packets = self._blank()
         per_packet = len(self._packets) / model.columns
         columns_of_packets = (np.arange(len(self._packets)) / per_packet).astype(np.int64)
@@ -181,7 +182,7 @@ class SpinningLidar:
 
     def frame(self, time_us: Int64Array, start_s: float, index: int) -> Packets:
         """The packets of a turn."""
-        distance_m, intensity = self._caster.cast(start_s, index)
+        distance_m, intensity = self.caster.cast(start_s, index)
         packets = self._packets.copy()
         shape = packets["blocks"]["channels"].shape  # both returns of a column follow each other
         packets["blocks"]["channels"]["radius"] = (

@@ -4,10 +4,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.lidar.robosense_decoder import RobosenseDecoder
 from recorder.errors import ConfigError
-from simulated_devices.ideal import write_ideal
+from simulated_devices.ideal import LIDAR_NAMES, _cast_points, write_ideal
+from simulated_devices.lidar_scan import World
 from simulated_devices.rig import read_rig
+from simulated_devices.robosense import IMU_FROM_LIDAR, make_lidar
+from simulated_devices.robosense_mems import M1Lidar
+from simulated_devices.robosense_packets import Identity, Mode, Motion
+from simulated_devices.scene import Room
 from simulated_devices.timing import DeviceClock
+from simulated_devices.world import Trajectory
 
 DURATION_S = 2.0
 
@@ -34,6 +41,31 @@ def test_the_twin_of_a_seed_is_always_the_same(tmp_path: Path) -> None:
     settings = ("simulate.seed=3", "devices.left.width=64", "devices.left.height=64", "devices.right.width=64")
     first, second = (twin_lines(tmp_path / name, *settings) for name in ("first", "second"))
     assert first == second
+
+
+@pytest.mark.parametrize("model", ["m2", "m3", "e1", "airy", "helios32", "helios16p", "rs16"])
+def test_the_twin_of_a_lidar_has_the_points_that_its_packets_tell(model: str) -> None:
+    world = World(Room(seed=1), Trajectory.named("gentle", 1), IMU_FROM_LIDAR, 5)
+    mode = Mode(clock="ptp")
+    start_us, start_s = 1_700_000_000_000_000, 3.0
+    lidar = make_lidar(model, world, mode)
+    assert not isinstance(lidar, M1Lidar)
+    twin = _cast_points(lidar, start_us * 1000, start_s, 7)
+    motion = Motion((0.0, 0.0, 9.8), (0.0, 0.0, 0.0))
+    decoder = RobosenseDecoder()
+    decoder.feed(lidar.difop(start_us, Identity(bytes(5) + b"1", 6699, 7788, mode), motion))
+    packets = lidar.frame(start_us + lidar.packet_offset_ns // 1000, start_s, 7)
+    scans = [scan for packet in packets for scan in decoder.feed(packet.tobytes())] + decoder.finish()
+    (scan,) = scans
+    assert scan.model.startswith(f"RoboSense {LIDAR_NAMES.get(model, model.upper())} ")
+    assert scan.packets_received == len(packets)
+    told = scan.points[np.any([scan.points[axis] != 0 for axis in "xyz"], axis=0)]  # an E1 tells of no return as 0 m
+    assert len(told) == len(twin)
+    for axis in "xyz":
+        assert np.abs(told[axis] - twin[axis]).max() < 0.02
+    assert np.array_equal(told["ring"], twin["ring"])
+    assert np.array_equal(told["intensity"], twin["intensity"])
+    assert np.abs(told["timestamp"] - twin["timestamp"]).max() < 3e-4
 
 
 def test_a_device_without_an_ideal_twin_is_named(tmp_path: Path) -> None:
