@@ -27,8 +27,8 @@ BUCKET_SHARE = 0.1  # of the epoch's age while it is young
 BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
 IGNORE_TRUST, MIN_TRUST = 0.3, 0.5
-GRID_LEVEL = 0.02  # of the mean delay: what the place by the delay law may be wrong by
-LAW_ERROR = 0.02  # of the mean delay times the law's shape: one sigma of the place of the floor under a fitted law
+GRID_LEVEL = 0.008
+LAW_ERROR = 0.025  # of the mean delay times the law's shape: one sigma of the place of the floor under a fitted law
 CLEARANCE_ERROR = 0.6  # of the height above the place by the delay law
 GRID_LEVEL_S = 120  # the grid's curve is put on the lowest point of this last time
 REFIT_S = 2.0
@@ -94,7 +94,7 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x
     puts it than that may be wrong; "model": it lies there.
     """
     law_error = LAW_ERROR * grid.law.shape * grid.law.mean_ns
-    unsure = math.hypot(line.sigma_ns(now_x), 0.125 * grid.sd_curvature * (now_x - buckets[0].last_x) ** 2)
+    unsure = math.hypot(line.sigma_ns(now_x), 0.02 * grid.sd_curvature * (now_x - buckets[0].last_x) ** 2)
     trust = grid.trust / (1 + (grid.sd_height / max(unsure, 1.0)) ** 4)
     if grid.trust < IGNORE_TRUST:
         return line

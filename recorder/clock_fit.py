@@ -33,9 +33,11 @@ CLIP = (
 SHRINK = 0.6
 LEAST_DOUBT = 1e-6  # arrivals without any jitter leave none, and a weight must stay finite
 BLOCKS = 12
-UNSTEADY = 12.0
+UNSTEADY = 7.0
+UNSTEADY_FADES = 1.0
+UNSTEADY_LEVEL = 0.2
 TOUCHING = 1.4
-LEVEL = 0.4  # error of the level by that of slope times span
+LEVEL = 0.6  # error of the level by that of slope times span
 HIDDEN_LEVEL = 0.3
 GATHERED = 0.3  # spacing of delays below which polls gather them
 WANDER = 1.5  # a step of the mean delay by 1 in the middle of the span turns a line through the means by so much
@@ -228,10 +230,10 @@ def _blend_window(
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
-            unsure = _touching_error(low_y - slope_hull * low_x)
+            usual, unsure = _touching_error(low_y - slope_hull * low_x)
             if hides is not None:
                 hidden = hides(slope_hull)
-            unsteady = 0.0 if hides is not None else min(UNSTEADY * unsure / spread, 1.0) ** 4 * 4.0 / (1 + minutes)
+            unsteady = 0.0 if hides is not None else _unsteadiness(usual, spread, minutes)
             sd_hull = math.hypot(unsure, hidden.slope_ns, max(unsteady, LEAST_DOUBT) * spread) / span
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
                 sd_means = math.inf
@@ -252,18 +254,27 @@ def _blend_window(
     clear = above.size >= 9 and any(float(part.min()) > limit for part in thirds)
     room = _slope_room(low_x, above, lowest) + 0.5 * spread / span * math.exp(-minutes)
     sd_slope = min(sd_slope, math.hypot(room, hidden.slope_ns / span))
-    level = math.hypot(LEVEL * _touching_error(height), HIDDEN_LEVEL * hidden.level_ns, 0.001 * spread)
+    usual, unsure = _touching_error(height)
+    level = math.hypot(LEVEL * unsure, HIDDEN_LEVEL * hidden.level_ns, 0.001 * spread)
+    if hides is None:
+        level = math.hypot(level, UNSTEADY_LEVEL * _unsteadiness(usual, spread, minutes) * spread)
     return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear, wander
 
 
-def _touching_error(height: Floats) -> float:
+def _touching_error(height: Floats) -> tuple[float, float]:
     """One sigma of the slope times the span of a line laid under points, from their heights above it.
 
-    The typical least height in a twelfth of the span; the factors are from trials with gamma laws of shapes 0.7 to 2,
-    steady and in waves.
+    First as if there were many points, then as is: by the typical least height in a twelfth of the span; the factors
+    are from trials with gamma laws of shapes 0.7 to 2, steady and in waves.
     """
     low = np.array([part.min() for part in np.array_split(height - height.min(), min(BLOCKS, height.size))])
-    return TOUCHING * float(np.median(low)) * (BLOCKS / low.size) ** 1.7
+    usual = TOUCHING * float(np.median(low))
+    return usual, usual * (BLOCKS / low.size) ** 1.7
+
+
+def _unsteadiness(usual: float, spread: float, minutes: float) -> float:
+    """How far the floor itself may move slowly, in spreads: hardly, where the lowest points lie close to the line."""
+    return min(UNSTEADY * usual / spread, 1.0) ** 4 * 4.0 / (1 + minutes) ** UNSTEADY_FADES
 
 
 def _slope_room(x: Floats, above: Floats, lowest: int) -> float:

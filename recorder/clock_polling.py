@@ -44,7 +44,7 @@ RECENT = 30  # buckets
 MAX_WAITING = 64
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
-COARSE_ERROR = 0.02
+COARSE_ERROR = 0.1  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
 STEADIEST, LOOSEST = 0.003, 0.015  # jitter of polls in periods; else it may be the device's own rhythm
 COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows unless the delays are longer still
 
@@ -127,7 +127,7 @@ class PollingGrid:
         def hidden(slope: float) -> Hidden:
             phase = np.sort(x * (1 + slope) % period)
             gap = float(np.diff(phase, append=phase[0] + period).max())
-            return Hidden(gap, gap if period < COARSE_NS else period)
+            return Hidden(gap, gap) if period < COARSE_NS else Hidden(max(gap, COARSE_ERROR * period), period)
 
         return hidden
 
@@ -142,7 +142,7 @@ class PollingGrid:
         if not STEADIEST * period < jitter < LOOSEST * period:
             return 0.0
         hidden = 0.0 if self._real else period / math.sqrt(12) * math.exp(-age_s / 60)
-        return math.hypot(hidden, COARSE_ERROR * period if period > COARSE_NS else 0.0)
+        return hidden
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:
         """Take note of a bucket's samples."""
