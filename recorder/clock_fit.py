@@ -37,7 +37,7 @@ UNSTEADY = 7.0
 UNSTEADY_FADES = 1.0
 UNSTEADY_LEVEL = 0.2
 TOUCHING = 1.4
-LEVEL = 0.6  # error of the level by that of slope times span
+LEVEL = 0.45  # error of the level by that of slope times span
 HIDDEN_LEVEL = 0.3
 GATHERED = 0.3  # spacing of delays below which polls gather them
 WANDER = 1.5  # a step of the mean delay by 1 in the middle of the span turns a line through the means by so much
@@ -257,7 +257,7 @@ def _blend_window(
     usual, unsure = _touching_error(height)
     level = math.hypot(LEVEL * unsure, HIDDEN_LEVEL * hidden.level_ns, 0.001 * spread)
     if hides is None:
-        level = math.hypot(level, UNSTEADY_LEVEL * _unsteadiness(usual, spread, minutes) * spread)
+        level = math.hypot(level, UNSTEADY_LEVEL * _unsteadiness(usual, spread, minutes) * spread / (1 + minutes))
     return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear, wander
 
 
