@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 from recorder import devices as attached
 from recorder import simulation
+from recorder.cli_calibrate import calibrate
 from recorder.cli_common import Folder, RigFile, clear_errors, stop_on_signals
 from recorder.cli_formats import export, import_
 from recorder.decode import decode as decode_capture
@@ -343,6 +344,7 @@ def check(verbose: bool, recording: Path, as_json: bool, deep: bool) -> None:
     sys.exit(report.exit_code)
 
 
+main.add_command(calibrate)
 main.add_command(export)
 main.add_command(import_)
 
