@@ -19,7 +19,8 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from simulated_devices.scene import CameraRenderer, Image, PinholeCamera, Room
+from simulated_devices.board_scene import BoardWall, renderer
+from simulated_devices.scene import Image, PinholeCamera, Room
 from simulated_devices.timing import MILLISECOND_NS, DelayModel, Opened, Pacer, Stage
 from simulated_devices.world import Trajectory
 
@@ -124,7 +125,7 @@ class CameraSimulator:
         settings: CameraSettings,
         stage: Stage,
         trajectory: Trajectory,
-        room: Room,
+        scene: Room | BoardWall,
         camera: PinholeCamera,
     ) -> None:
         if not 0 < settings.fps <= 200:
@@ -138,7 +139,7 @@ class CameraSimulator:
         self._camera = camera
         self._clock = stage.clock(settings.clock or name)
         self._delay = stage.delay(name, DELAY)
-        self._renderer = CameraRenderer(room, camera, seed=stage.seed_for("camera", name))
+        self._renderer = renderer(scene, camera, seed=stage.seed_for("camera", name))
         self._skipped = 0
 
     def open(self, folder: Path) -> dict[str, object]:

@@ -20,6 +20,7 @@ from drivers.samples import POINT_DTYPE, FixSample, FrameSample, ImuSample, Pose
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.recording.manifest import DeviceSummary, StreamSummary
 from recorder.recording.writer import RecordingWriter, new_manifest
+from simulated_devices.board_scene import renderer
 from simulated_devices.bno08x_rvc import Bno08xRvcSettings
 from simulated_devices.camera import ClientStream, PictureEncoder
 from simulated_devices.lidar_scan import World
@@ -31,7 +32,7 @@ from simulated_devices.robosense_mems import M1Lidar, VectorLidar
 from simulated_devices.robosense_packets import Mode
 from simulated_devices.robosense_spinning import SpinningLidar
 from simulated_devices.sampling import SampleGrid
-from simulated_devices.scene import CameraRenderer, M1Scanner, PinholeCamera
+from simulated_devices.scene import M1Scanner, PinholeCamera
 from simulated_devices.timing import SECOND_NS, Int64Array, random_for
 from simulated_devices.world import ImuNoise, NoisyImu, NoisyMagnetometer
 
@@ -134,13 +135,13 @@ class Twin:
     def _camera(self, order: int, name: str) -> Iterator[Item]:
         camera: PinholeCamera = self._cast.cameras[self.cameras.index(name)]
         fps = self._rate_hz(name, "fps", 20)
-        renderer = CameraRenderer(self._cast.room, camera, seed=self._cast.stage.seed_for("camera", name))
+        drawer = renderer(self._cast.scene, camera, seed=self._cast.stage.seed_for("camera", name))
         encoder = PictureEncoder(ClientStream(), camera.width, camera.height, fps)
         video = VideoFormat("h264", camera.width, camera.height, fps, "yuv420p")
         for times_ns in self._times(name, fps):
             rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
             for index, time_ns in enumerate(times_ns.tolist()):
-                picture = renderer.render(rotation[index], position_m[index])
+                picture = drawer.render(rotation[index], position_m[index])
                 packet = encoder.encode(picture, time_ns // 1000)
                 exposure_s = self.entries[name].get("exposure_s")
                 sample = FrameSample(time_ns, bytes(packet), bool(packet.is_keyframe), video, exposure_s)

@@ -20,7 +20,7 @@ from multiprocessing import connection, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import msgspec
 import yaml
@@ -28,6 +28,7 @@ import yaml
 from recorder.errors import ConfigError
 from recorder.rig import DEVICE_NAME, apply_settings
 from simulated_devices.ascii_imu import AsciiImuSettings, ascii_imu_simulator
+from simulated_devices.board_scene import DEFAULT_BOARD, BoardWall, board_cameras
 from simulated_devices.bno08x_rvc import Bno08xRvcSettings, bno08x_rvc_simulator
 from simulated_devices.camera import CameraSettings, CameraSimulator
 from simulated_devices.faults import NO_FAULTS, FaultSettings
@@ -69,6 +70,8 @@ class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     jitter: factor on all transport jitter and bursts. skew_ppm: bound of the skew each clock draws.
     faults: what goes wrong with each device, by its name. lidars: how each simulated lidar is set up, by its name.
+    scene: "room", or "board" for cameras that are held before a calibration board (the trajectory is then one of its
+    own). board: which one. lens: model of the cameras that look at it.
     """
 
     trajectory: str = "gentle"
@@ -77,6 +80,9 @@ class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
     skew_ppm: float = 50.0
     faults: dict[str, FaultSettings] = {}
     lidars: dict[str, LidarSettings] = {}
+    scene: Literal["room", "board"] = "room"
+    board: str = DEFAULT_BOARD
+    lens: Literal["pinhole", "brown-conrady", "kannala-brandt4"] = "pinhole"
 
 
 class SimulatedDevice(Protocol):
@@ -138,6 +144,8 @@ def simulate_settings(source: Mapping[str, Any]) -> SimulateSettings:
     for key in ("seed", "jitter", "skew_ppm"):
         if getattr(settings, key) < 0:
             raise ConfigError(f"simulate.{key}: must not be negative")
+    if settings.scene == "room" and settings.lens != "pinhole":
+        raise ConfigError(f"simulate.lens: {settings.lens} can only be had with simulate.scene=board")
     return settings
 
 
@@ -146,14 +154,14 @@ def calibration(cameras: list[PinholeCamera]) -> dict[str, Any]:
     return {
         "cameras": [
             {
-                "model": "pinhole",
+                "model": camera.model,
                 "focalLengthX": camera.fx,
                 "focalLengthY": camera.fy,
                 "principalPointX": camera.cx,
                 "principalPointY": camera.cy,
                 "imageWidth": camera.width,
                 "imageHeight": camera.height,
-                "distortionCoefficients": [],
+                "distortionCoefficients": list(camera.distortion),
                 "imuToCamera": camera.camera_from_imu.tolist(),
             }
             for camera in cameras
@@ -210,11 +218,17 @@ class Cast:
     def __init__(self, settings: SimulateSettings, epoch_ns: int | None = None) -> None:
         """epoch_ns: host time at which the clocks show their start values (default: now)."""
         try:
-            self.trajectory = Trajectory.named(settings.trajectory, settings.seed)
+            trajectory = "board" if settings.scene == "board" else settings.trajectory
+            self.trajectory = Trajectory.named(trajectory, settings.seed)
         except ValueError as error:
             raise ConfigError(f"simulate.trajectory: {error}") from error
         self.room = Room(settings.seed)
         self.stage = Stage(settings.seed, settings.jitter, settings.skew_ppm, epoch_ns=epoch_ns)
+        try:
+            self.scene = BoardWall(settings.board, settings.seed) if settings.scene == "board" else self.room
+        except ValueError as error:
+            raise ConfigError(f"simulate.board: {error}") from error
+        self._lens = settings.lens
         self.cameras: list[PinholeCamera] = []
         self.ports = UdpPorts()
         self._faults = settings.faults
@@ -283,9 +297,12 @@ class Cast:
         for key in ("width", "height"):
             if getattr(settings, key) % 2 or not 32 <= getattr(settings, key) <= 4096:
                 raise ValueError(f"devices.{name}.{key}: must be even, from 32 to 4096")
-        camera = stereo_pair(settings.width, settings.height)[len(self.cameras)]
+        pair = stereo_pair(settings.width, settings.height)
+        if self._lens != "pinhole":
+            pair = board_cameras(self._lens, settings.width, settings.height)
+        camera = pair[len(self.cameras)]
         self.cameras.append(camera)
-        return CameraSimulator(name, settings, self.stage, self.trajectory, self.room, camera)
+        return CameraSimulator(name, settings, self.stage, self.trajectory, self.scene, camera)
 
     def _pose(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = self._with_ports(name, _convert(entry, PoseSettings, f"devices.{name}"), ("port",))

@@ -143,9 +143,10 @@ def _levels(picture: Image) -> tuple[Image, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
-    """An ideal camera: pixel (0, 0) is centred on (0.0, 0.0); axes right, down, forward.
+    """A camera: pixel (0, 0) is centred on (0.0, 0.0); axes right, down, forward.
 
-    fx, fy, cx, cy in pixels; camera_from_imu: (4, 4) float64, maps IMU points into the camera.
+    fx, fy, cx, cy in pixels; camera_from_imu: (4, 4) float64, maps IMU points into the camera. model, distortion: of
+    the lens, as in calibration.json; only a calibration board is seen through others than the ideal one.
     """
 
     width: int
@@ -155,6 +156,8 @@ class PinholeCamera:
     cx: float
     cy: float
     camera_from_imu: FloatArray
+    model: str = "pinhole"
+    distortion: tuple[float, ...] = ()
 
 
 STEREO_FIELD_OF_VIEW_DEG = 80.0
@@ -174,6 +177,29 @@ def stereo_pair(width: int = 640, height: int = 400, baseline_m: float = 0.1) ->
     return cameras[0], cameras[1]
 
 
+class SensorNoise:
+    """Noise of an image sensor, another one for each picture."""
+
+    def __init__(self, shape: tuple[int, int], sigma: float, seed: int) -> None:
+        """shape: height, width; sigma in gray levels."""
+        self._shape = shape
+        self._generator = np.random.default_rng(seed)
+        # The noise is two fields, what to add and what to take away: saturating 8-bit sums are the cheapest.
+        field = np.rint(self._generator.normal(0.0, sigma, (2 * shape[0], 2 * shape[1]))) if sigma > 0 else None
+        self._fields: tuple[Image, Image] | None = None
+        if field is not None:
+            self._fields = (np.maximum(field, 0).astype(np.uint8), np.maximum(-field, 0).astype(np.uint8))
+
+    def add_to(self, picture: Image) -> None:
+        """Add the next noise to a picture of that shape."""
+        if self._fields is None:
+            return
+        row, column = self._generator.integers(0, self._shape)
+        window = (slice(row, row + self._shape[0]), slice(column, column + self._shape[1]))
+        cv2.add(picture, self._fields[0][window], dst=picture)
+        cv2.subtract(picture, self._fields[1][window], dst=picture)
+
+
 class CameraRenderer:
     """Draws what a camera sees, frame after frame; the sensor noise depends on the seed and the call's number."""
 
@@ -187,13 +213,7 @@ class CameraRenderer:
         self._rows = np.arange(camera.height, dtype=np.float64)
         self._columns = np.arange(camera.width, dtype=np.int16)
         self._scratch: Image = np.empty((camera.height, camera.width), dtype=np.uint8)
-        self._generator = np.random.default_rng(seed)
-        # The noise is two fields, what to add and what to take away: saturating 8-bit sums are the cheapest.
-        shape = (2 * camera.height, 2 * camera.width)
-        field = np.rint(self._generator.normal(0.0, noise_sigma, shape)) if noise_sigma > 0 else None
-        self._noise: tuple[Image, Image] | None = None
-        if field is not None:
-            self._noise = (np.maximum(field, 0).astype(np.uint8), np.maximum(-field, 0).astype(np.uint8))
+        self._noise = SensorNoise((camera.height, camera.width), noise_sigma, seed)
 
     def render(self, R: FloatArray, p: FloatArray) -> Image:  # noqa: N803 - a rotation matrix
         """Picture (height, width) uint8 from the IMU's pose: R (3, 3) world_from_imu and p (3,) in metres."""
@@ -202,11 +222,7 @@ class CameraRenderer:
         world_from_pixel = R @ self._imu_from_pixel
         for face in self._room.faces:
             self._draw_face(picture, face, center_m, world_from_pixel)
-        if self._noise is not None:
-            row, column = self._generator.integers(0, (self._camera.height, self._camera.width))
-            window = (slice(row, row + self._camera.height), slice(column, column + self._camera.width))
-            cv2.add(picture, self._noise[0][window], dst=picture)
-            cv2.subtract(picture, self._noise[1][window], dst=picture)
+        self._noise.add_to(picture)
         return picture
 
     def _draw_face(self, picture: Image, face: Face, center_m: FloatArray, ray: FloatArray) -> None:

@@ -66,6 +66,13 @@ _STYLES = {
         speed_rms_m_s=0.62,
         rate_rms_rad_s=1.40,
     ),
+    # A rig that is held before a calibration board and shows it from all sides.
+    "board": _Style(
+        amplitude=((0.10, 0.04), (0.22, 0.08), (0.15, 0.06), (0.36, 0.14), (0.26, 0.10), (0.40, 0.15)),
+        frequency=((0.50, 1.30), (0.83, 1.70), (1.10, 1.90), (0.71, 1.60), (0.97, 2.10), (0.62, 1.40)),
+        speed_rms_m_s=0.20,
+        rate_rms_rad_s=0.45,
+    ),
 }
 
 
@@ -84,7 +91,7 @@ class Trajectory:
 
     @staticmethod
     def named(name: str, seed: int) -> Trajectory:
-        """Build the trajectory `name` ("gentle" or "brisk"), varied by `seed`.
+        """Build the trajectory `name` ("gentle", "brisk" or "board"), varied by `seed`.
 
         Raises ValueError for another name.
         """
