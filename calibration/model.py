@@ -76,6 +76,15 @@ class Calibration(msgspec.Struct, kw_only=True):
     extra: dict[str, Any] = {}
 
 
+def to_matrix(values: npt.ArrayLike) -> Matrix:
+    """A (4, 4) array as it stands in a Camera. Raises CalibrationError for another shape."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (4, 4):
+        raise CalibrationError(f"a transformation must be 4x4, is {'x'.join(map(str, array.shape)) or 'a number'}")
+    rows = [tuple(row) for row in array.tolist()]
+    return (rows[0], rows[1], rows[2], rows[3])
+
+
 def load_calibration(path: Path) -> Calibration:
     """Read calibration.json. Raises CalibrationError, also when there is no such file."""
     try:

@@ -151,7 +151,7 @@ class BoardRenderer:
 
 
 def _rays(camera: PinholeCamera) -> tuple[FloatMap, FloatMap]:
-    """x and y of each pixel's ray at z = 1, (height, width) each."""
+    """X and y of each pixel's ray at z = 1, (height, width) each."""
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     grid = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     pixels = np.stack([grid[1].ravel(), grid[0].ravel()], axis=1)[:, None]

@@ -20,8 +20,8 @@ from drivers.samples import POINT_DTYPE, FixSample, FrameSample, ImuSample, Pose
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.recording.manifest import DeviceSummary, StreamSummary
 from recorder.recording.writer import RecordingWriter, new_manifest
-from simulated_devices.board_scene import renderer
 from simulated_devices.bno08x_rvc import Bno08xRvcSettings
+from simulated_devices.board_scene import renderer
 from simulated_devices.camera import ClientStream, PictureEncoder
 from simulated_devices.lidar_scan import World
 from simulated_devices.nmea import ORIGIN, SIGMA_M

@@ -28,8 +28,8 @@ import yaml
 from recorder.errors import ConfigError
 from recorder.rig import DEVICE_NAME, apply_settings
 from simulated_devices.ascii_imu import AsciiImuSettings, ascii_imu_simulator
-from simulated_devices.board_scene import DEFAULT_BOARD, BoardWall, board_cameras
 from simulated_devices.bno08x_rvc import Bno08xRvcSettings, bno08x_rvc_simulator
+from simulated_devices.board_scene import DEFAULT_BOARD, BoardWall, board_cameras
 from simulated_devices.camera import CameraSettings, CameraSimulator
 from simulated_devices.faults import NO_FAULTS, FaultSettings
 from simulated_devices.imu import ImuSimulator
