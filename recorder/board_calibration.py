@@ -122,7 +122,7 @@ def _look(
         seen.size = (frame.width, frame.height)
         if number not in looked_at:
             continue
-        picture: Image = frame.to_ndarray(format="gray")
+        picture = np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
         corners = board.detect(picture)
         if usable(board, corners):
             seen.corners[number] = corners
