@@ -9,8 +9,13 @@ from calibration.model import CalibrationError
 
 # What an axis can point to, in the camera's frame (x right, y down, z forward).
 DIRECTIONS = {
-    "right": (1, 0, 0), "left": (-1, 0, 0), "down": (0, 1, 0), "up": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)
-}  # fmt: skip
+    "right": (1, 0, 0),
+    "left": (-1, 0, 0),
+    "down": (0, 1, 0),
+    "up": (0, -1, 0),
+    "forward": (0, 0, 1),
+    "back": (0, 0, -1),
+}
 
 
 @dataclass(frozen=True, slots=True)

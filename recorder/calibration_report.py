@@ -67,14 +67,14 @@ def print_calibration(result: BoardCalibration, console: Console) -> None:
     """Table of cameras, coverage, baselines and warnings."""
     table = Table(box=None, pad_edge=False)
     for name in ("camera", "model", "views", "dropped", "corners", "error px", "fx", "fy", "cx", "cy"):
-        table.add_column(name, justify="left" if name in ("camera", "model") else "right")
+        table.add_column(name, justify="left" if name in ("camera", "model") else "right", no_wrap=True)
     for index, fit in enumerate(result.fits):
         camera = fit.camera
         corners = sum(len(errors) for errors in fit.errors)
-        numbers = (camera.focal_length_x_px, camera.focal_length_y_px)
-        numbers += (camera.principal_point_x_px, camera.principal_point_y_px)
+        focal_px = (camera.focal_length_x_px, camera.focal_length_y_px)
+        centre_px = (camera.principal_point_x_px, camera.principal_point_y_px)
         counts = (str(len(fit.views)), str(len(fit.dropped)), str(corners), f"{fit.rms_px:.3f}")
-        table.add_row(str(index), camera.model, *counts, *(f"{number:.2f}" for number in numbers))
+        table.add_row(str(index), camera.model, *counts, *(f"{number:.2f}" for number in focal_px + centre_px))
     console.print(table)
     for index, (seen, fit) in enumerate(zip(result.seen, result.fits, strict=True)):
         counts_map = coverage(seen, fit)

@@ -13,9 +13,12 @@ from rich.progress import Progress
 from calibration.board_page import PAPERS_MM, draw_page, to_pdf, to_png
 from calibration.boards import KINDS, Board
 from calibration.estimate import MODELS
+from calibration.fourseasons import IMAGES
 from calibration.imu_pose import AS_DESIGNED, axes_rotation, designed
 from calibration.model import Calibration, CalibrationError, dump, load_calibration, validate
+from calibration.opencv_yaml import UNITS_M
 from recorder.board_calibration import calibrate_cameras
+from recorder.calibration_import import FORMATS, Choices, import_calibration
 from recorder.calibration_report import print_calibration, to_html
 from recorder.cli_common import RigFile, clear_errors, stop_on_signals
 from recorder.errors import ConfigError, RecorderError, StorageError
@@ -29,7 +32,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 NewFile = click.Path(dir_okay=False, path_type=Path)
 
 
-class BoardType(click.ParamType):
+class BoardType(click.ParamType[Board]):
     """A board as text, like charuco:9x6:30."""
 
     name = "BOARD"
@@ -206,7 +209,7 @@ def cameras(
     Examples:
       rigtape calibrate cameras demo/board -o calibration.json
       rigtape calibrate cameras demo/board --board aprilgrid:6x4:45 --model kannala-brandt4 -o calibration.json
-      rigtape calibrate cameras --live rig.yaml --imu-axes forward,left,up --imu-translation 0.05 0 0 -o calibration.json
+      rigtape calibrate cameras --live rig.yaml --imu-axes forward,left,up --imu-translation 0 0.05 0 -o new.json
     """
     if (recording is None) == (live is None):
         raise click.UsageError("give a RECORDING, or --live RIG.yaml to make one")
@@ -264,3 +267,74 @@ def _pose_of(folder: Path) -> FloatArray:
     if not found:
         raise ConfigError(f"{folder / 'calibration.json'}: there is no camera in it")
     return found[0].matrix
+
+
+class SizeType(click.ParamType[tuple[int, int]]):
+    """Width and height, like 1280x800."""
+
+    name = "WIDTHxHEIGHT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """The two numbers, or an error of the command line."""
+        if isinstance(value, tuple):
+            return value
+        width, _, height = value.lower().partition("x")
+        if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+            self.fail(f"{value!r}: write it like 1280x800", param, ctx)
+        return int(width), int(height)
+
+
+@calibrate.command("import")
+@click.argument("sources", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--format", "kind", type=click.Choice(FORMATS), required=True, help="Who wrote SOURCES.")
+@click.option("-o", "--output", type=NewFile, required=True, help="The calibration.json to write.")
+@click.option("--size", type=SizeType(), help="Size of the pictures (oak: default the sensor's; opencv).")
+@click.option("--socket", "sockets", multiple=True, metavar="CAM_B", help="oak: a camera, in their order (repeatable).")
+@click.option("--images", type=click.Choice(IMAGES), help="4seasons: which images the recording has.")
+@click.option("--model", type=click.Choice(MODELS[:2]), help="opencv: the lens, where four numbers leave it open.")
+@click.option("--unit", type=click.Choice(list(UNITS_M)), default="m", show_default=True, help="opencv: of T.")
+@imu_options
+@click.pass_obj
+def import_(
+    verbose: bool,
+    sources: tuple[Path, ...],
+    kind: str,
+    output: Path,
+    size: tuple[int, int] | None,
+    sockets: tuple[str, ...],
+    images: str | None,
+    model: str | None,
+    unit: str,
+    imu_to_camera: str | None,
+    imu_axes: str | None,
+    imu_translation: tuple[float, ...] | None,
+) -> None:
+    """Make a calibration.json of what other programs or devices know.
+
+    kalibr: camchain(-imucam).yaml, and imu.yaml if you like; oak: the EEPROM as JSON; 4seasons: the calibration
+    folder; opencv: files of cv2.FileStorage (or ROS camera_info); spectacular-ai: another calibration.json. With the
+    --imu options all cameras are moved together, so that camera 0 is where you say.
+
+    \b
+    Examples:
+      rigtape calibrate import camchain-imucam.yaml imu.yaml --format kalibr -o calibration.json
+      rigtape calibrate import eeprom.json --format oak --size 640x400 --imu-to-camera oak-d-pro-w -o calibration.json
+      rigtape calibrate import calibration/ --format 4seasons --images undistorted -o calibration.json
+      rigtape calibrate import intrinsics.yml extrinsics.yml --format opencv --size 1280x800 --unit mm \\
+          --imu-axes forward,left,up --imu-translation 0 0.05 0 -o calibration.json
+    """
+    with clear_errors(verbose):
+        if imu_to_camera in AS_DESIGNED and kind == "oak" and sockets and sockets[0] != "CAM_B":
+            raise ConfigError(f"--imu-to-camera {imu_to_camera}: is known of CAM_B; give --socket CAM_B first")
+        pose = camera_from_imu(imu_to_camera, imu_axes, imu_translation)
+        choices = Choices(size, sockets, images, model, unit)
+        imported = import_calibration(list(sources), kind, choices, pose)
+        for note in imported.notes:
+            click.echo(f"note: {note}", err=True)
+        if imu_to_camera in AS_DESIGNED:
+            imported.calibration.extra["imuToCameraSource"] = AS_DESIGNED[imu_to_camera].source
+        write_calibration(imported.calibration, output)
+    for index, camera in enumerate(imported.calibration.cameras):
+        size_text = f"{camera.image_width_px}x{camera.image_height_px}"
+        click.echo(f"camera {index}: {camera.model} {size_text}, focal length {camera.focal_length_x_px:.2f} px")
+    click.echo(f"written: {output}")
