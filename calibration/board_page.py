@@ -35,7 +35,7 @@ def draw_page(board: Board, paper: str) -> Image:
     part = "square" if board.kind == "charuco" else "tag"
     text = f"{board}   print at 100 %; each {part} must measure {board.size_mm:g} mm"
     cv2.putText(page, text, (left, page.shape[0] - 40), cv2.FONT_HERSHEY_SIMPLEX, 1.6, 0, 3, cv2.LINE_8)
-    return page
+    return np.asarray(cv2.threshold(page, 127, WHITE, cv2.THRESH_BINARY)[1], dtype=np.uint8)
 
 
 def to_png(page: Image) -> bytes:

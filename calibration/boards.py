@@ -233,7 +233,6 @@ def _refined(
     moved = cv2.cornerSubPix(picture, start.copy(), (half_window, half_window), (-1, -1), criteria)
     refined = np.asarray(moved, dtype=np.float64).reshape(-1, 2)
     near = np.linalg.norm(refined - pixels, axis=1) < half_window
-    unique_ids, first = np.unique(ids, return_index=True)  # a tag seen twice is not two
-    keep = np.zeros(len(ids), dtype=bool)
-    keep[first[np.bincount(np.searchsorted(unique_ids, ids)) == 1]] = True
-    return ids[near & keep], refined[near & keep]
+    _, first, times = np.unique(ids, return_index=True, return_counts=True)
+    kept = first[(times == 1) & near[first]]  # a tag seen twice is not two
+    return ids[kept], refined[kept]

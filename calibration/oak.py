@@ -14,7 +14,17 @@ from typing import Any
 import numpy as np
 
 from calibration.model import Calibration, CalibrationError, Camera
-from calibration.sources import BROWN_COUNT, FloatArray, Imported, inverted, make_camera, numbers, pose_of, read_text, square
+from calibration.sources import (
+    BROWN_COUNT,
+    FloatArray,
+    Imported,
+    inverted,
+    make_camera,
+    numbers,
+    pose_of,
+    read_text,
+    square,
+)
 
 SOCKETS = {f"CAM_{letter}": number for number, letter in enumerate("ABCDEFGH")}
 PERSPECTIVE, FISHEYE = 0, 1
