@@ -125,7 +125,7 @@ def _calibration(rig: Rig, cameras: list[RigDevice]) -> bytes | None:
         calibration = load_calibration(rig.calibration)
     except CalibrationError as error:
         raise ConfigError(str(error)) from error
-    faults = validate(calibration) + _too_few(calibration, cameras)
+    faults = validate(calibration) + _too_few(calibration, cameras) + _other_size(calibration, cameras)
     if faults:
         raise ConfigError("\n".join(f"{rig.calibration}: {fault}" for fault in faults))
     return dump(calibration)
@@ -136,6 +136,19 @@ def _too_few(calibration: Calibration, cameras: list[RigDevice]) -> list[str]:
         return []
     names = ", ".join(camera.name for camera in cameras)
     return [f"has {len(calibration.cameras)} cameras, the rig has {len(cameras)} ({names})"]
+
+
+def _other_size(calibration: Calibration, cameras: list[RigDevice]) -> list[str]:
+    """Cameras whose pictures are set to another size than the calibration is for."""
+    faults = []
+    for index, (lens, device) in enumerate(zip(calibration.cameras, cameras, strict=False)):
+        size = (getattr(device.config, "width", None), getattr(device.config, "height", None))
+        expected = (lens.image_width_px, lens.image_height_px)
+        if None not in size and size != expected:
+            faults.append(
+                f"camera {index} is for {expected[0]}x{expected[1]} pictures, {device.name} sends {size[0]}x{size[1]}"
+            )
+    return faults
 
 
 def _connect(rig: Rig, drivers: dict[str, Driver], stop: threading.Event, on_event: OnEvent) -> set[str]:

@@ -115,8 +115,7 @@ def _check_calibration(folder: Path, manifest: Manifest | None, findings: Findin
         text = str(error).removeprefix(f"{folder}/{CALIBRATION_NAME}: ")
         findings.add("error", "calibration", CALIBRATION_NAME, text)
         return None
-    if faults := validate(calibration):
-        findings.add("error", "calibration", CALIBRATION_NAME, "; ".join(faults))
+    findings.add_each("error", "calibration", CALIBRATION_NAME, validate(calibration))
     if manifest and len(calibration.cameras) < len(manifest.cameras):
         text = f"has {len(calibration.cameras)} cameras, the recording has {len(manifest.cameras)}"
         findings.add("error", "calibration-cameras", CALIBRATION_NAME, text)

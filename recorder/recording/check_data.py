@@ -3,7 +3,7 @@
 import os
 import stat
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -56,6 +56,11 @@ class Findings:
             self._by_key[code, subject] = Finding(severity, code, subject, text)
         else:
             found.count += 1
+
+    def add_each(self, severity: Severity, code: str, subject: str, texts: Iterable[str]) -> None:
+        """Add some that differ, each with a line of its own."""
+        for text in texts:
+            self._by_key[code, f"{subject}: {text}"] = Finding(severity, code, subject, text)
 
     def sorted(self) -> list[Finding]:
         """Errors, warnings, notes."""

@@ -324,6 +324,15 @@ def test_a_fault_says_what_and_where(good: Recording, fault: str, words: str) ->
     assert words in "\n".join(finding.text for finding in check(good.folder).findings)
 
 
+def test_each_fault_of_the_calibration_has_its_line(good: Recording) -> None:
+    good.calibration["cameras"][1].update(focalLengthX=-1, principalPointY=1e4)
+    good.write()
+    found = [finding.text for finding in check(good.folder).findings if finding.code == "calibration"]
+    assert len(found) == 2
+    assert "camera 1: focalLengthX must be positive" in found[0]
+    assert "camera 1: principalPointY 10000 is outside" in found[1]
+
+
 AFTER: dict[str, tuple[Callable[[Path], object], str, int]] = {
     "no data": (lambda folder: (folder / "data.jsonl").unlink(), "no-data", 2),
     "no calibration": (lambda folder: (folder / "calibration.json").unlink(), "calibration", 2),

@@ -32,6 +32,8 @@ KINDS = {"imu": ("imu", 200.0), "left": ("frames", 20.0), "right": ("frames", 20
 
 class FakeConfig(DeviceConfig):
     name: str = "groundTruth"
+    width: int | None = None
+    height: int | None = None
 
 
 class FakeDriver:
@@ -379,6 +381,13 @@ def test_a_calibration_with_too_few_cameras_is_refused(bench, calibration):
     bench.add("left")
     bench.add("right")
     with pytest.raises(ConfigError, match="has 1 cameras, the rig has 2"):
+        bench.record(stop=threading.Event())
+
+
+def test_a_calibration_for_pictures_of_another_size_is_refused(bench):
+    bench.add("left", width=64, height=48)
+    bench.add("right", width=128, height=96)
+    with pytest.raises(ConfigError, match="camera 1 is for 64x48 pictures, right sends 128x96"):
         bench.record(stop=threading.Event())
 
 

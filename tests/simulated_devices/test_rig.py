@@ -243,7 +243,10 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("simulate.colour=1", ["simulate.colour", "allowed: faults, jitter, lidars, seed, skew_ppm, trajectory"]),
+        (
+            "simulate.colour=1",
+            ["simulate.colour", "allowed: board, faults, jitter, lens, lidars, scene, seed, skew_ppm, trajectory"],
+        ),
         ("simulate.seed=-1", ["simulate.seed"]),
         ("simulate.lidars.radar={}", ["simulate.lidars.radar", "lidar"]),
         ("simulate.lidars.lidar.time=ntp", ["simulate.lidars", "time", "ntp"]),
@@ -276,7 +279,8 @@ def test_wrong_use_is_one_line_and_exit_code_2():
     command = [sys.executable, "-m", "simulated_devices", "--set", "simulate.colour=1"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr == "simulate.colour: unknown key; allowed: faults, jitter, lidars, seed, skew_ppm, trajectory\n"
+    allowed = "board, faults, jitter, lens, lidars, scene, seed, skew_ppm, trajectory"
+    assert ended.stderr == f"simulate.colour: unknown key; allowed: {allowed}\n"
 
 
 def test_settings_change_the_rig():
