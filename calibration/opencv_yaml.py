@@ -113,7 +113,9 @@ def _lens(path: Path, values: dict[str, Any], matrix_name: str, coefficients_nam
     if matrix[0, 1]:
         raise CalibrationError(f"{where}: has skew {matrix[0, 1]:g}, which a calibration.json cannot hold")
     found = values.get(coefficients_name)
-    coefficients = [] if found is None else np.ravel(np.asarray(found, dtype=np.float64)).tolist()
+    if isinstance(found, str | float):
+        raise CalibrationError(f"{path}: {coefficients_name}: must be a list of numbers")
+    coefficients = [] if found is None else np.ravel(found).tolist()
     size = None
     for width, height in (
         ("image_width", "image_height"),

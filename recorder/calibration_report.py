@@ -66,15 +66,16 @@ def _where_empty(counts: npt.NDArray[np.int64]) -> str:
 def print_calibration(result: BoardCalibration, console: Console) -> None:
     """Table of cameras, coverage, baselines and warnings."""
     table = Table(box=None, pad_edge=False)
-    for name in ("camera", "model", "views", "dropped", "corners", "error px", "fx", "fy", "cx", "cy"):
-        table.add_column(name, justify="left" if name in ("camera", "model") else "right", no_wrap=True)
+    for name in ("camera", "views", "dropped", "corners", "error px", "fx", "fy", "cx", "cy"):
+        table.add_column(name, justify="left" if name == "camera" else "right", no_wrap=True)
     for index, fit in enumerate(result.fits):
         camera = fit.camera
         corners = sum(len(errors) for errors in fit.errors)
         focal_px = (camera.focal_length_x_px, camera.focal_length_y_px)
         centre_px = (camera.principal_point_x_px, camera.principal_point_y_px)
         counts = (str(len(fit.views)), str(len(fit.dropped)), str(corners), f"{fit.rms_px:.3f}")
-        table.add_row(str(index), camera.model, *counts, *(f"{number:.2f}" for number in focal_px + centre_px))
+        table.add_row(str(index), *counts, *(f"{number:.2f}" for number in focal_px + centre_px))
+    console.print(f"lens model {result.fits[0].camera.model}, {result.looked_at} sets of pictures looked at")
     console.print(table)
     for index, (seen, fit) in enumerate(zip(result.seen, result.fits, strict=True)):
         counts_map = coverage(seen, fit)

@@ -125,7 +125,12 @@ def write_new(output: Path, data: bytes) -> None:
     """Write a file that must not be there yet. Raises StorageError."""
     try:
         with output.open("xb") as file:
-            file.write(data)
+            try:
+                file.write(data)
+                file.flush()
+            except OSError:
+                output.unlink()
+                raise
     except FileExistsError as error:
         raise StorageError(f"{output}: is there already; choose another name") from error
     except OSError as error:
