@@ -181,6 +181,9 @@ class Board:
         if self.kind == "charuco":
             return cv2.aruco.CharucoDetector(self._chessboard, cv2.aruco.CharucoParameters(), parameters)
         parameters.markerBorderBits = TAG_BORDER_BITS
+        # The black squares touch the tags' corners: in a picture twice as large small tags still come apart.
+        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 5, 45
+        parameters.adaptiveThreshWinSizeStep = 10
         return cv2.aruco.ArucoDetector(self._dictionary, parameters)
 
     def _detect_chessboard(self, picture: Image) -> tuple[npt.NDArray[np.int64], FloatArray]:
@@ -194,18 +197,20 @@ class Board:
         return _refined(picture, numbers, np.asarray(found, dtype=np.float64).reshape(-1, 2), room)
 
     def _detect_tags(self, picture: Image) -> tuple[npt.NDArray[np.int64], FloatArray]:
-        markers, ids, _ = self._detector.detectMarkers(picture)
+        enlarged = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        markers, ids, _ = self._detector.detectMarkers(enlarged)
         if ids is None or len(ids) == 0:
             return _nothing()
         numbers = np.asarray(ids, dtype=np.int64).ravel()
         ours = numbers < self.columns * self.rows
         if not np.any(ours):
             return _nothing()
-        quads = np.asarray(markers, dtype=np.float64).reshape(-1, 4, 2)[ours]
+        quads = (np.asarray(markers, dtype=np.float64).reshape(-1, 4, 2)[ours] + 0.5) / 2 - 0.5
         quads = np.roll(quads, 2, axis=1)  # they stand on their head
         corner_ids = (numbers[ours, None] * 4 + np.arange(4)).ravel()
         border_share = TAG_BORDER_BITS / (self._dictionary.markerSize + 2 * TAG_BORDER_BITS)
-        room = min(border_share, self.detail_mm / self.size_mm) * float(np.median([_shortest_side(q) for q in quads]))
+        smallest_px = float(np.percentile([_shortest_side(quad) for quad in quads], 10))
+        room = 0.7 * min(border_share, self.detail_mm / self.size_mm) * smallest_px
         return _refined(picture, corner_ids, quads.reshape(-1, 2), room)
 
 

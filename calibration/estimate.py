@@ -21,6 +21,7 @@ MIN_CORNERS = 8
 MIN_VIEWS = 10
 MAX_VIEWS = 60
 OUTLIER_FACTOR = 3.0  # a view this much worse than the median one is dropped
+CORNER_OUTLIER_FACTOR = 6.0  # a corner this much worse than the median one is left out
 OUTLIER_MIN_PX = 0.3
 ROUNDS = 3
 WORST_RMS_PX = 3.0  # above this, what was found is not the lens
@@ -38,12 +39,14 @@ class Fit:
     """One camera as estimated.
 
     camera: its camera_from_imu is the identity. views: numbers of the views used; dropped: of those that did not fit.
-    poses: (4, 4) camera_from_board of each view used; errors: (n, 2) px of each, seen minus expected.
+    corners: those of each view that were used; errors: (n, 2) px of them, seen minus expected. poses: (4, 4)
+    camera_from_board of each view.
     """
 
     camera: Camera
     views: list[int]
     dropped: list[int]
+    corners: list[Corners]
     poses: list[FloatArray]
     errors: list[FloatArray]
 
@@ -121,7 +124,7 @@ def fit_camera(
             fit = _fit(board, chosen, size, model)
         except cv2.error as error:
             raise CalibrationError(f"{name}: no {model} lens explains what is seen ({error.err or error})") from error
-        if not _drop_outliers(chosen, fit):
+        if not _drop_outliers(board, chosen, fit):
             break
         if len(chosen.numbers) < MIN_VIEWS:
             raise CalibrationError(f"{name}: fewer than {MIN_VIEWS} views agree; is {board} the right board?")
@@ -133,15 +136,26 @@ def fit_camera(
     return fit
 
 
-def _drop_outliers(views: _Views, fit: Fit) -> bool:
+def _drop_outliers(board: Board, views: _Views, fit: Fit) -> bool:
+    """Take out single corners, and views, that are much worse than the others; whether there were any."""
+    lengths = [np.linalg.norm(errors, axis=1) for errors in fit.errors]
+    worst_px = max(CORNER_OUTLIER_FACTOR * float(np.median(np.concatenate(lengths))), OUTLIER_MIN_PX)
     each_px = np.array([_rms(errors) for errors in fit.errors])
-    bad = each_px > max(OUTLIER_FACTOR * float(np.median(each_px)), OUTLIER_MIN_PX)
-    if not np.any(bad):
-        return False
-    views.dropped += [number for number, is_bad in zip(views.numbers, bad, strict=True) if is_bad]
-    views.corners = [corners for corners, is_bad in zip(views.corners, bad, strict=True) if not is_bad]
-    views.numbers = [number for number, is_bad in zip(views.numbers, bad, strict=True) if not is_bad]
-    return True
+    worst_view_px = max(OUTLIER_FACTOR * float(np.median(each_px)), OUTLIER_MIN_PX)
+    numbers, kept = [], []
+    changed = False
+    for number, corners, length in zip(views.numbers, views.corners, lengths, strict=True):
+        good = length <= worst_px
+        changed = changed or not np.all(good)
+        left = Corners(corners.ids[good], corners.pixels[good])
+        if usable(board, left) and np.median(length) <= worst_view_px:
+            numbers.append(number)
+            kept.append(left)
+        else:
+            changed = True
+            views.dropped.append(number)
+    views.numbers, views.corners = numbers, kept
+    return changed
 
 
 def _fit(board: Board, views: _Views, size: tuple[int, int], model: str) -> Fit:
@@ -228,7 +242,7 @@ def _with_errors(board: Board, views: _Views, camera: Camera, turns: Sequence[An
         poses.append(pose)
         expected = project(camera, _moved(board.points_m[corners.ids], pose))
         errors.append(np.nan_to_num(corners.pixels - expected, nan=IMPOSSIBLE_PX))
-    return Fit(camera, list(views.numbers), list(views.dropped), poses, errors)
+    return Fit(camera, list(views.numbers), list(views.dropped), list(views.corners), poses, errors)
 
 
 def opencv_matrix(camera: Camera) -> FloatArray:

@@ -31,7 +31,7 @@ td,th{padding:.2em .8em;text-align:right;border-bottom:1px solid #ddd}img{margin
 
 def coverage(seen: Seen, fit: Fit) -> npt.NDArray[np.int64]:
     """Corners used in each cell of the picture, (down, across)."""
-    pixels = np.concatenate([seen.corners[number].pixels for number in fit.views])
+    pixels = np.concatenate([corners.pixels for corners in fit.corners])
     cells = np.clip((pixels / seen.size * GRID).astype(np.int64), 0, np.array(GRID) - 1)
     counts = np.zeros((GRID[1], GRID[0]), dtype=np.int64)
     np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
@@ -143,8 +143,8 @@ def _colour(error_px: float) -> tuple[int, int, int]:
 def _corner_map(seen: Seen, fit: Fit) -> Image:
     scale = PANEL_WIDTH / seen.size[0]
     canvas: Image = np.full((round(seen.size[1] * scale), PANEL_WIDTH, 3), 250, np.uint8)
-    for number, errors in zip(fit.views, fit.errors, strict=True):
-        for pixel, error in zip(seen.corners[number].pixels * scale, np.linalg.norm(errors, axis=1), strict=True):
+    for corners, errors in zip(fit.corners, fit.errors, strict=True):
+        for pixel, error in zip(corners.pixels * scale, np.linalg.norm(errors, axis=1), strict=True):
             cv2.circle(canvas, (round(pixel[0]), round(pixel[1])), 2, _colour(float(error)), -1, cv2.LINE_AA)
     return canvas
 

@@ -95,6 +95,17 @@ def test_views_that_lie_are_dropped() -> None:
     assert not set(fit.dropped) & set(fit.views)
 
 
+def test_single_corners_that_lie_are_left_out() -> None:
+    left, _ = look("brown-conrady")
+    for number in range(0, 28, 2):
+        left[number].pixels[4] += (1.5, -2.0)
+    fit = fit_camera(BOARD, left, SIZE, "brown-conrady")
+    assert fit.dropped == []
+    for number, corners in zip(fit.views, fit.corners, strict=True):
+        assert len(left[number].ids) - len(corners.ids) == (number % 2 == 0)
+    assert fit.rms_px == pytest.approx(0.05 * np.sqrt(2), rel=0.1)
+
+
 def test_three_more_coefficients_only_where_the_lens_needs_them() -> None:
     left, _ = look("brown-conrady")
     assert fit_camera(BOARD, left, SIZE, "brown-conrady").camera.distortion_coefficients[5:] == [0, 0, 0]
