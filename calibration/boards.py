@@ -27,6 +27,7 @@ GAP_SHARE = 0.3  # of an AprilGrid's tag, Kalibr's usual tagSpacing
 TAG_BORDER_BITS = 2
 SPEC = re.compile(r"(charuco|aprilgrid):(\d{1,3})x(\d{1,3}):(\d{1,4}(?:\.\d+)?)(?::(\d{1,4}(?:\.\d+)?))?")
 WHITE = 255
+WIDE_WINDOW_PX = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,16 +229,23 @@ def _refined(
     """Corners moved onto the saddle points near them; those for which there is none are left out."""
     half_window = int(np.clip(round(room_px), 2, 6))
     height, width = picture.shape
-    margin = half_window + 2
+    margin = max(half_window, WIDE_WINDOW_PX) + 2
     inside = np.all((pixels >= margin) & (pixels < np.array([width, height]) - margin), axis=1)
     ids, pixels = ids[inside], pixels[inside]
     if len(ids) == 0:
         return _nothing()
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    moved = cv2.cornerSubPix(picture, start.copy(), (half_window, half_window), (-1, -1), criteria)
-    refined = np.asarray(moved, dtype=np.float64).reshape(-1, 2)
-    near = np.linalg.norm(refined - pixels, axis=1) < half_window
+    # Corners of small tags are given some pixels off: a wide look brings them near, a narrow one onto the point.
+    nearer = _saddles(picture, pixels, max(half_window, WIDE_WINDOW_PX))
+    refined = _saddles(picture, nearer, half_window)
+    near = np.linalg.norm(refined - pixels, axis=1) < max(half_window, WIDE_WINDOW_PX)
+    near &= np.linalg.norm(refined - nearer, axis=1) < half_window
     _, first, times = np.unique(ids, return_index=True, return_counts=True)
     kept = first[(times == 1) & near[first]]  # a tag seen twice is not two
     return ids[kept], refined[kept]
+
+
+def _saddles(picture: Image, pixels: FloatArray, half_window_px: int) -> FloatArray:
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    moved = cv2.cornerSubPix(picture, start, (half_window_px, half_window_px), (-1, -1), criteria)
+    return np.asarray(moved, dtype=np.float64).reshape(-1, 2)

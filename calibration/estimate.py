@@ -30,6 +30,7 @@ RATIONAL_GAIN = 0.97  # k4 k5 k6 are used when they bring the error below this p
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
 NO_DISTORTION = cv2.CALIB_ZERO_TANGENT_DIST + cv2.CALIB_FIX_K1 + cv2.CALIB_FIX_K2 + cv2.CALIB_FIX_K3
 CENTRED = cv2.CALIB_FIX_PRINCIPAL_POINT
+FARTHEST_RAD = (1.3, 1.0, 0.7)  # guesses of how far from the axis corners are seen, in turn; OpenCV fails beyond 1.57
 _NAMES = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4 and 5
 FISHEYE_FLAGS = _NAMES.CALIB_RECOMPUTE_EXTRINSIC + _NAMES.CALIB_FIX_SKEW + _NAMES.CALIB_USE_INTRINSIC_GUESS
 
@@ -205,17 +206,20 @@ def _fit_brown(
 def _fit_fisheye(
     board: Board, views: _Views, size: tuple[int, int], points: Sequence[Any], pixels: Sequence[Any]
 ) -> Fit:
-    focal_px = max(size) / np.pi
-    matrix = np.array([[focal_px, 0, (size[0] - 1) / 2], [0, focal_px, (size[1] - 1) / 2], [0, 0, 1.0]])
-    _, matrix, found, turns, shifts = cv2.fisheye.calibrate(
-        [p.astype(np.float64).reshape(1, -1, 3) for p in points],
-        [p.astype(np.float64).reshape(1, -1, 2) for p in pixels],
-        size,
-        matrix,
-        np.zeros(4),
-        flags=FISHEYE_FLAGS,
-        criteria=CRITERIA,
-    )
+    centre = (np.array(size) - 1) / 2
+    farthest_px = max(float(np.linalg.norm(corners.pixels - centre, axis=1).max()) for corners in views.corners)
+    on_board, seen = ([p.astype(np.float64).reshape(1, -1, n) for p in each] for each, n in ((points, 3), (pixels, 2)))
+    for farthest_rad in FARTHEST_RAD:
+        focal_px = farthest_px / farthest_rad
+        matrix = np.array([[focal_px, 0, centre[0]], [0, focal_px, centre[1]], [0, 0, 1.0]])
+        try:
+            _, matrix, found, turns, shifts = cv2.fisheye.calibrate(
+                on_board, seen, size, matrix, np.zeros(4), flags=FISHEYE_FLAGS, criteria=CRITERIA
+            )
+            break
+        except cv2.error:
+            if farthest_rad == FARTHEST_RAD[-1]:
+                raise
     camera = _camera("kannala-brandt4", matrix, found.ravel().tolist(), size)
     return _with_errors(board, views, camera, turns, shifts)
 
