@@ -20,8 +20,7 @@ from calibration.opencv_yaml import UNITS_M
 from recorder.board_calibration import calibrate_cameras
 from recorder.calibration_import import FORMATS, Choices, import_calibration
 from recorder.calibration_report import print_calibration, to_html
-from recorder.cli_common import RigFile, stop_on_signals
-from recorder.cli_errors import clear_errors
+from recorder.cli_common import RigFile, clear_errors, stop_on_signals
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.rig import load_rig
 from recorder.session import record
