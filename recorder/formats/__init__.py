@@ -29,7 +29,7 @@ that cannot be read as they should be raise FormatError, naming file, line, and 
 tables so.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -98,7 +98,8 @@ class Source:
 
     clock: what the times are, for people (`utc_at_time_0.source`). cameras: names, in the order of PictureSet.images.
     sample_count: of all streams together, for the progress; 0: not known. files: what a recording has no place for, by
-    file name; kept in its folder imported/, where an exporter of the same system finds it.
+    relative path, content or the file to copy; kept in its folder imported/, where an exporter of the same system finds
+    it. A path must be made of names chosen here or found in a folder, never of text in a file.
     """
 
     streams: list[Stream]
@@ -106,7 +107,7 @@ class Source:
     cameras: tuple[str, ...] = ()
     calibration: Calibration | None = None
     sample_count: int = 0
-    files: dict[str, bytes] = field(default_factory=dict)
+    files: Mapping[str, bytes | Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """A Source becomes a recording: streams merged by time, pictures encoded without loss."""
 
 import heapq
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,10 +38,8 @@ def write_source(
     if first is None:
         raise FormatError(f"{origin['source']}: there are no samples in it")
     out.mkdir()
-    if source.files:
-        (out / FILES_FOLDER).mkdir()
-        for name, data in sorted(source.files.items()):
-            write_atomically(out / FILES_FOLDER / Path(name).name, data)
+    for name, data in sorted(source.files.items()):
+        _keep(out / FILES_FOLDER / name, data)
     writing = _Writing(source, out, first[0], origin)
     try:
         writing.take(first)
@@ -56,6 +55,14 @@ def write_source(
         report.wrote(stream, count, "data.jsonl")
     if writing.unusable:
         report.leave_out("gps", writing.unusable, "without altitude or accuracy")
+
+
+def _keep(path: Path, data: bytes | Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(data, Path):
+        shutil.copyfile(data, path)
+    else:
+        write_atomically(path, data)
 
 
 Item = tuple[int, Stream, Sample]
