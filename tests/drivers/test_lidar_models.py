@@ -5,7 +5,6 @@ import json
 import lzma
 import struct
 import zlib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
