@@ -253,6 +253,31 @@ def test_membership_is_exact_whatever_the_network_does(seed: int, begin: int, lo
         assert np.all(np.diff(scan.points["timestamp"]) >= 0)
 
 
+@given(
+    st.integers(0, 1 << 32), st.sampled_from([0.0, 0.05, 0.5]), st.integers(0, 15), st.sampled_from([1, 7, 64, 1000])
+)
+@settings(deadline=None)
+def test_many_at_once_are_placed_as_one_by_one(seed: int, loss: float, delay: int, batch: int) -> None:
+    packets = [one for _, one in disturbed(seed, 0, loss, delay)]
+    singly, at_once = m1_decoder(), m1_decoder()
+    wanted = [(number, scan) for number, one in enumerate(packets) for scan in singly.feed(one)]
+    found: list[tuple[int, ScanSample]] = []
+    for first in range(0, len(packets), batch):
+        scans, ticks = at_once.feed_many(packet_array(packets[first : first + batch]))
+        found += [(first + number, scan) for number, scan in scans]
+        assert ticks.min() >= START_US
+    wanted += [(-1, scan) for scan in singly.finish()]
+    found += [(-1, scan) for scan in at_once.finish()]
+    assert [number for number, _ in found] == [number for number, _ in wanted]
+    for (_, one), (_, other) in zip(found, wanted, strict=True):
+        assert one.points.tobytes() == other.points.tobytes()
+        assert (one.first_ticks, one.last_ticks, one.packets_expected, one.packets_received, one.duplicates) == (
+            other.first_ticks, other.last_ticks, other.packets_expected, other.packets_received, other.duplicates,
+        )  # fmt: skip
+    for counter in ("duplicates", "late", "lost_packets", "restarts", "bad"):
+        assert getattr(at_once, counter) == getattr(singly, counter)
+
+
 @given(st.lists(st.binary(max_size=1300), max_size=20))
 def test_any_bytes(packets: list[bytes]) -> None:
     decoder = m1_decoder()
