@@ -35,6 +35,7 @@ CAPTURES = {
     "firefly-II": "2010-07-08",
     "ublox-zed-f9p-nmea": "2019-04-12",
     "gp-320fw-2019-04-07-coldboot": "2019-04-07",
+    "nmea-fuzzy-cases": "2020-03-18",
 }
 NOON = "2026-11-22T12:00:00"
 
