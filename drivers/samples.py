@@ -56,7 +56,7 @@ class FixSample(Struct, frozen=True, gc=False):
     undulation_m: float | None
     accuracy_m: float | None
     vertical_accuracy_m: float | None
-    accuracy_source: Literal["gst", "dop", "none"]
+    accuracy_source: Literal["gst", "pubx", "dop", "none"]
     quality: int
     satellites: int | None
     hdop: float | None

@@ -2,7 +2,7 @@
 
 Three steps. The scanner finds sentences with a good checksum among whatever else is on the line. The sentences of one
 epoch, known by their UTC time of day and in no particular order, are gathered. An epoch that is over becomes a fix:
-position from GGA, accuracy from GST or from the dilutions in GGA and GSA, date from RMC or ZDA.
+position from GGA, accuracy from GST, PUBX,00 or the dilutions in GGA and GSA, date from RMC or ZDA.
 """
 
 import math
@@ -31,7 +31,7 @@ ROLLOVER_NS = 1024 * 7 * DAY_NS
 
 _LATITUDE_LONGITUDE = re.compile(rb"(\d{1,2})(\d\d(?:\.(\d*))?),([NS]),(\d{1,3})(\d\d(?:\.\d*)?),([EW])")
 
-Source = Literal["gst", "dop", "none"]
+Source = Literal["gst", "pubx", "dop", "none"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +92,7 @@ class _Epoch(Struct):
     gns: _Position | None = None
     date_ns: int | None = None
     sigmas_m: tuple[float, float | None] | None = None
+    pubx_m: tuple[float, float | None] | None = None
     seen: dict[bytes, int] = {}
     tail: bytes | None = None
     is_over: bool = False
@@ -185,7 +186,7 @@ class NmeaDecoder:
     def _take_gsa(self, body: bytes) -> None:
         """The dilutions, of the epoch that is open or was just closed; where there is GST nobody asks for them."""
         epoch = self._epoch
-        if epoch is None or epoch.sigmas_m is not None:
+        if epoch is None or epoch.sigmas_m is not None or epoch.pubx_m is not None:
             return
         fields = body.split(b",")
         if len(fields) in (18, 19):  # NMEA 4.1 adds the system
@@ -240,6 +241,8 @@ class NmeaDecoder:
         """Horizontal, vertical and where they are from. A vertical dilution serves until it is two seconds old."""
         if epoch.sigmas_m is not None:
             return *epoch.sigmas_m, "gst"
+        if epoch.pubx_m is not None:
+            return *epoch.pubx_m, "pubx"
         uere_m = self.rules.uere_m.get(position.quality)
         if not position.hdop or uere_m is None:
             return None, None, "none"
@@ -313,6 +316,15 @@ def _gather_gst(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
         epoch.sigmas_m = (math.hypot(latitude_m, longitude_m), number(fields[8], 0, 1e6))
 
 
+def _gather_pubx(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
+    """Receivers of u-blox say with PUBX,00 how good they take the position to be."""
+    if fields[0] != b"PUBX" or fields[1] != b"00" or len(fields) < 11:
+        return
+    horizontal_m = number(fields[9], 0, 1e6)
+    if horizontal_m:
+        epoch.pubx_m = (horizontal_m, number(fields[10], 0, 1e6))
+
+
 def _gather_zda(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
     if len(fields) >= 5 and epoch.date_ns is None:
         epoch.date_ns = date_ns(fields[2], fields[3], fields[4])
@@ -338,6 +350,7 @@ _KINDS = {
     b"GNS,": _Kind(1, _gather_gns, True),
     b"RMC,": _Kind(1, _gather_rmc, True),
     b"GST,": _Kind(1, _gather_gst, True),
+    b"BX,0": _Kind(2, _gather_pubx, True),
     b"ZDA,": _Kind(1, _gather_zda),
     b"GBS,": _Kind(1),
     b"GRS,": _Kind(1),

@@ -137,6 +137,17 @@ def test_accuracy_without_gst_is_by_dilution() -> None:
     assert (fix.accuracy_m, fix.vertical_accuracy_m, fix.accuracy_source) == (4.0, 8.0, "dop")
 
 
+def test_accuracy_as_u_blox_says_it() -> None:
+    pubx = sentence("PUBX,00,120000.00,6010.428,N,02454.390,E,32.1,G3,2.1,2.4,0.007,77.52,0.007,,0.92,1.19,0.77,9,0,0")
+    other = sentence("PUBX,03,2,23,-,,,45,010,29,e,,,45,010") + sentence("PUBX,04,120000.00,221126,0,2,18,0,0,21")
+    (fix,) = decode(gga() + other + pubx)
+    assert (fix.accuracy_m, fix.vertical_accuracy_m, fix.accuracy_source) == (2.1, 2.4, "pubx")
+    (fix,) = decode(gga() + pubx + gst())
+    assert fix.accuracy_source == "gst"
+    first, second = decode(gga() + pubx + gga("120001.00"))
+    assert (first.accuracy_source, second.accuracy_source) == ("pubx", "dop")
+
+
 def test_vertical_accuracy_is_by_the_vertical_dilution_where_it_is_sent() -> None:
     gsa = sentence("GNGSA,A,3,01,02,,,,,,,,,,,1.5,0.80,1.20,1")
     first, second, later = decode(gga() + gsa + gga("120001.00") + gga("120004.00"))
