@@ -122,7 +122,7 @@ class NmeaDecoder:
     _last_utc_ns: int | None = None
     _ender: tuple[bytes, int] | None = None
     _previous_tail: tuple[bytes, int] | None = None
-    _vdop: tuple[int, float | None] | None = None
+    _gsa: tuple[int, bytes] = (0, b"")
     _time_text: bytes | None = None
     _time_ns: int | None = None
 
@@ -156,7 +156,8 @@ class NmeaDecoder:
     def _take(self, offset: int, body: bytes, kind: "_Kind", fixes: list[FixSample]) -> None:
         time_field, gather, is_of_fix = kind
         if time_field == NO_TIME:
-            self._take_gsa(body)
+            if self._epoch is not None:
+                self._gsa = (self._epoch.day_ns, body)
             return
         fields = body.split(b",")
         if time_field >= len(fields):
@@ -182,15 +183,6 @@ class NmeaDecoder:
             epoch.is_incomplete = True
         elif self._ender is not None and self._ender == (address, count):
             self._close(fixes)
-
-    def _take_gsa(self, body: bytes) -> None:
-        """The dilutions, of the epoch that is open or was just closed; where there is GST nobody asks for them."""
-        epoch = self._epoch
-        if epoch is None or epoch.sigmas_m is not None or epoch.pubx_m is not None:
-            return
-        fields = body.split(b",")
-        if len(fields) in (18, 19):  # NMEA 4.1 adds the system
-            self._vdop = (epoch.day_ns, number(fields[17], 0, MAX_HDOP))
 
     def _learn(self) -> None:
         """What a whole epoch tells about the next: how the cycle ends, and a date that came after its fix was given.
@@ -247,8 +239,9 @@ class NmeaDecoder:
         if not position.hdop or uere_m is None:
             return None, None, "none"
         accuracy_m = position.hdop * uere_m
-        if self._vdop is not None and self._vdop[1] and 0 <= epoch.day_ns - self._vdop[0] <= VDOP_AGE_NS:
-            return accuracy_m, self._vdop[1] * uere_m, "dop"
+        gsa_day_ns, gsa = self._gsa
+        if 0 <= epoch.day_ns - gsa_day_ns <= VDOP_AGE_NS and (vdop := _vertical_dilution(gsa)):
+            return accuracy_m, vdop * uere_m, "dop"
         return accuracy_m, accuracy_m * self.rules.vertical_per_horizontal, "dop"
 
     def _utc_ns(self, epoch: _Epoch) -> int:
@@ -331,6 +324,13 @@ def _gather_zda(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
 
 
 NO_TIME = 0
+
+
+def _vertical_dilution(gsa: bytes) -> float | None:
+    commas = gsa.count(b",")
+    if commas not in (17, 18):  # NMEA 4.1 adds the system
+        return None
+    return number(gsa.rsplit(b",", commas - 16)[1], 0, MAX_HDOP)
 
 
 class _Kind(NamedTuple):
