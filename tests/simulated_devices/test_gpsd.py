@@ -75,7 +75,8 @@ def test_gpsd_reports_the_fixes_that_we_decode(reports):
     for line in reports:
         if line.startswith(b"{"):
             report = json.loads(line)
-            if report["class"] == "TPV" and "lat" in report:  # several in an epoch: on a busy host each with a part
+            if report["class"] == "TPV" and {"lat", "time"} <= report.keys():
+                # Several in an epoch; on a busy host each has a part.
                 positions.setdefault(utc_ns(report["time"]), {}).update(report)
         else:
             fixes |= {fix.device_ticks: fix for fix in decoder.feed(line)}
