@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock_estimator import KEPT_SKEW_PPM, LATE_NS, Estimator, Ints, S
-from recorder.clock_fit import PPM, SlopePrior
+from recorder.clock_fit import PPM, Floats, SlopePrior
 from recorder.clock_refine import refine_epoch
 
 FAR = 1 << 61  # ticks and device times beyond this are garbage
@@ -37,6 +37,10 @@ RECONNECTED_NS = 50_000_000  # after a reconnection the clock has run on if a sa
 MIN_BATCH = 32  # smaller ones are not worth numpy
 TWO_WAY_KEPT = 64
 NEVER_NS = -(1 << 63)
+SHARED_SKEW_S = 30  # an epoch that lasts so long tells the others its skew
+MIN_TICKS = 3  # from sample to sample: fewer look the same when samples are lost
+MIN_STEPS = 100
+DITHER = 0.05  # share of steps that differ by a tick
 
 
 @dataclass(slots=True)
@@ -405,6 +409,10 @@ class ClockMap:
         """Work out the line anew; a few ms, in any thread."""
         self._estimator.refit()
 
+    def settle(self) -> None:
+        """No stamp of this epoch has been used yet: let the newest line hold for all of it, without slewing."""
+        self._estimator.settle()
+
     @property
     def epoch(self) -> int:
         """Sync epoch, from 0; counts up when the clocks jumped against each other."""
@@ -471,24 +479,60 @@ def stored_sigma_ppm(sigma_ppm: float, age_s: float) -> float:
     return min(math.hypot(max(sigma_ppm, KEPT_SKEW_PPM), temperature_ppm, ageing_ppm), 100.0)
 
 
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """Two-sided host times of a recording, one sigma of each (the least delay apart), and the sync epoch, (n,) each."""
+
+    host_ns: Ints
+    sigma_ns: Floats
+    epochs: Ints
+
+
 def refine(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0) -> Ints:
     """Host times of a whole recording of one stream, each from all arrivals before and after it."""
+    return refine_all(ticks, arrival_ns, tick_hz, wrap_bits).host_ns
+
+
+def refine_all(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0) -> Refinement:
+    """`refine` with its uncertainty. The sync epochs of the recording share a skew."""
     ticks, arrival_ns = np.asarray(ticks, dtype=np.int64), np.asarray(arrival_ns, dtype=np.int64)
     device_ns, epochs, plain = _unwrap_all(ticks, arrival_ns, tick_hz, wrap_bits)
-    host_ns = arrival_ns.copy()
-    for epoch in np.unique(epochs):
-        chosen = np.flatnonzero(epochs == epoch)
+    host_ns, sigma_ns = arrival_ns.copy(), np.zeros(ticks.size)
+    members = [np.flatnonzero(epochs == epoch) for epoch in np.unique(epochs)]
+    prior: SlopePrior | None = None
+    for chosen in sorted(members, key=lambda chosen: -int(np.ptp(arrival_ns[chosen]))):
         learn = chosen[plain[chosen]]
         if not learn.size:
+            sigma_ns[chosen] = LATE_NS
             continue
         learn = learn[np.argsort(device_ns[learn], kind="stable")]
         anchor_device, anchor_host = device_ns[learn[0]], arrival_ns[learn[0]]
         x = (device_ns[learn] - anchor_device).astype(np.float64)
         y = (arrival_ns[learn] - anchor_host).astype(np.float64) - x
+        curve = refine_epoch(x, y, prior)
         ahead = device_ns[chosen] - anchor_device
-        offset = refine_epoch(x, y).at(ahead.astype(np.float64))
+        half_tick_ns = _half_tick_ns(device_ns[learn], S / tick_hz)
+        offset = curve.at(ahead.astype(np.float64)) + half_tick_ns
         host_ns[chosen] = anchor_host + ahead + np.rint(offset).astype(np.int64)
-    return np.minimum(host_ns, arrival_ns)
+        sigma_ns[chosen] = math.hypot(curve.sigma_ns, half_tick_ns / math.sqrt(3))
+        if prior is None and x[-1] > SHARED_SKEW_S * S:
+            first, last = curve.at(x[[0, -1]]).tolist()
+            prior = SlopePrior((last - first) / float(x[-1]), KEPT_SKEW_PPM * PPM)
+    return Refinement(np.minimum(host_ns, arrival_ns), sigma_ns, epochs)
+
+
+def _half_tick_ns(device_ns: Ints, tick_ns: float) -> float:
+    """How much earlier than the events their ticks are on average, where a coarse counter cuts the time off.
+
+    The curve lies under the ticks that are latest against their events, so all others are early by up to a tick. A
+    device that samples by its ticks is not concerned: its steps have a common measure.
+    """
+    counts = np.rint(np.diff(device_ns) / tick_ns).astype(np.int64)
+    if counts.size < MIN_STEPS or int(np.gcd.reduce(counts)) != 1:
+        return 0.0
+    usual = int(np.median(counts))
+    differs = float(np.mean(np.abs(counts - usual) == 1))
+    return 0.5 * tick_ns if usual >= MIN_TICKS and differs > DITHER else 0.0
 
 
 def _unwrap_all(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int) -> tuple[Ints, Ints, NDArray[np.bool_]]:

@@ -318,6 +318,11 @@ class Estimator:
                 line = combine(line, self.grid_line, buckets, self.level, self.last_x)
             self._ready = (epoch, line)
 
+    def settle(self) -> None:
+        """Nothing of this epoch has been put out yet: put out the newest line from the epoch's start on."""
+        self._adopt()
+        self.line = SlewedLine(self.line.start_x, self.fit.offset, self.fit.slope)
+
     def _adopt(self) -> None:
         """Take over a finished refit, below what has come since."""
         ready, self._ready = self._ready, None

@@ -230,7 +230,7 @@ def _blend_window(
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0:
-            usual, unsure = _touching_error(low_y - slope_hull * low_x)
+            usual, unsure = touching_error(low_y - slope_hull * low_x)
             if hides is not None:
                 hidden = hides(slope_hull)
             unsteady = 0.0 if hides is not None else _unsteadiness(usual, spread, minutes)
@@ -254,22 +254,22 @@ def _blend_window(
     clear = above.size >= 9 and any(float(part.min()) > limit for part in thirds)
     room = _slope_room(low_x, above, lowest) + 0.5 * spread / span * math.exp(-minutes)
     sd_slope = min(sd_slope, math.hypot(room, hidden.slope_ns / span))
-    usual, unsure = _touching_error(height)
+    usual, unsure = touching_error(height)
     level = math.hypot(LEVEL * unsure, HIDDEN_LEVEL * hidden.level_ns, 0.001 * spread)
     if hides is None:
         level = math.hypot(level, UNSTEADY_LEVEL * _unsteadiness(usual, spread, minutes) * spread / (1 + minutes))
     return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear, wander
 
 
-def _touching_error(height: Floats) -> tuple[float, float]:
+def touching_error(height: Floats, pieces: int = 1) -> tuple[float, float]:
     """One sigma of the slope times the span of a line laid under points, from their heights above it.
 
     First as if there were many points, then as is: by the typical least height in a twelfth of the span; the factors
-    are from trials with gamma laws of shapes 0.7 to 2, steady and in waves.
+    are from trials with gamma laws of shapes 0.7 to 2, steady and in waves. pieces: of which the line consists.
     """
-    low = np.array([part.min() for part in np.array_split(height - height.min(), min(BLOCKS, height.size))])
+    low = np.array([part.min() for part in np.array_split(height - height.min(), min(BLOCKS * pieces, height.size))])
     usual = TOUCHING * float(np.median(low))
-    return usual, usual * (BLOCKS / low.size) ** 1.7
+    return usual, usual * (BLOCKS * pieces / low.size) ** 1.7
 
 
 def _unsteadiness(usual: float, spread: float, minutes: float) -> float:

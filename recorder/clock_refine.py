@@ -6,14 +6,15 @@ one line if it touches the arrivals throughout (a steady oscillator), else knots
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_fit import Floats, hull_slope
-from recorder.clock_grid import LAW_PRIOR, Fitted, GridPoints, GridTracker, IntervalFit, snap
+from recorder.clock_fit import LEVEL, Floats, SlopePrior, hull_slope, touching_error
+from recorder.clock_grid import LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
 from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, without_late
 
 Ints = NDArray[np.int64]
@@ -32,15 +33,17 @@ ROUNDS = 4
 FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
+LAW_ERROR = 0.02  # of the mean delay times the law's shape
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Offset over device time, straight between knots."""
+    """Offset over device time, straight between knots, with one sigma of its height (the least delay apart)."""
 
     knots_x: Floats
     heights: Floats
+    sigma_ns: float = 0.0
 
     def at(self, x: Floats) -> Floats:
         """Offset at x, ns; straight on beyond the ends."""
@@ -83,13 +86,23 @@ def bending(knots_x: Floats, sigma: float = CURVATURE) -> Floats:
     return penalty
 
 
-def envelope(x: Floats, y: Floats, knots_x: Floats) -> Curve:
+def end_to_end(knots_x: Floats, prior: SlopePrior) -> Floats:
+    """(knots, knots): inverse covariance of the heights by what is known of the slope."""
+    ends = np.zeros(knots_x.size)
+    ends[0], ends[-1] = -1.0, 1.0
+    precision: Floats = np.outer(ends, ends) / (prior.sigma * (knots_x[-1] - knots_x[0])) ** 2
+    return precision
+
+
+def envelope(x: Floats, y: Floats, knots_x: Floats, prior: SlopePrior | None = None) -> Curve:
     """The highest smooth curve below all points: least sum of distances, by an interior point method.
 
     It is the most likely curve for exponential delays; with a single piece the line of Zhang, Liu, Xia, INFOCOM 2002.
     """
     basis, penalty = hat_basis(x, knots_x), bending(knots_x)
-    slope, _ = hull_slope(x, y)
+    slope, _ = hull_slope(x, y) if prior is None else (prior.slope, 0.0)
+    if prior is not None:
+        penalty += end_to_end(knots_x, prior)
     level = float((y - slope * x).min())
     height = y - slope * x - level
     unit = max(float(np.median(height)), 1.0)
@@ -127,20 +140,25 @@ def stays_clear(curve: Curve, x: Floats, y: Floats, limit_ns: float) -> bool:
     return False
 
 
-def envelope_by_data(x: Floats, y: Floats) -> Curve:
+def envelope_by_data(x: Floats, y: Floats, prior: SlopePrior | None = None) -> Curve:
     """The envelope of one sync epoch with as many knots as the data ask for."""
     slope = hull_slope(*lowest_points(x, y, 0.0))[0] if x[-1] - x[0] > MIN_SPAN_S * S else 0.0
+    if prior is not None:
+        slope = prior.slope
     low_x, low_y = lowest_points(x, y, slope)
     if low_x.size < 4:
-        return Curve(np.array([x[0], x[0] + S]), np.full(2, float(y.min())))
-    curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], np.inf))
+        height = y - slope * (x - x[0])
+        level = float(height.min())
+        return Curve(np.array([x[0], x[0] + S]), level + np.array([0.0, slope * S]), float(np.median(height)) - level)
+    curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], np.inf), prior)
     limit_ns = CLEAR * float(np.median(y - curve.at(x)))
     for spacing_s in KNOT_S:
         if not stays_clear(curve, low_x, low_y, limit_ns):
             break
-        curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], spacing_s))
+        curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], spacing_s), prior)
         limit_ns = CLEAR * float(np.median(y - curve.at(x)))
-    return curve
+    _, unsure = touching_error(low_y - curve.at(low_x), curve.knots_x.size - 1)
+    return replace(curve, sigma_ns=LEVEL * unsure)
 
 
 def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], float]:
@@ -160,8 +178,12 @@ def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], f
     return [p for p in points if p is not None], tracker.period_ns
 
 
-def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | None:
-    """The offset by the likelihood of the polls (`recorder.clock_grid`) near the envelope, and how far to trust it."""
+def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -> tuple[Curve, float, float] | None:
+    """The offset by the likelihood of the polls (`recorder.clock_grid`) near the envelope, and how far to trust it.
+
+    Third, how far above the floor the polls usually leave the envelope: with n delays that begin like a gamma law of
+    shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less than d late.
+    """
     slope = float((beneath.heights[-1] - beneath.heights[0]) / (beneath.knots_x[-1] - beneath.knots_x[0]))
     points, period = grid_points(x, y, slope)
     if not points or x[-1] - x[0] < 2 * MIN_SPAN_S * S:
@@ -175,6 +197,9 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | No
     if not spreads_over_polls(points, height, count):
         return None
     level = beneath.at(knots_x)
+    if prior is not None:
+        slope = prior.slope
+        precision += end_to_end(knots_x, prior)
     problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
     low = float(height.min())
     mean = max(float(count @ height / count.sum()) - low - 0.5 * period, 0.1 * period)
@@ -188,7 +213,11 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve) -> tuple[Curve, float] | No
             break
         problem.count = kept
         best = problem.climb(best.weights, best.law, MANY_STEPS)
-    return Curve(knots_x, level + best.weights), _trust(problem, best, at_x, points)
+    variance = np.linalg.inv(best.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
+    found = DelayLaw.of(best.law)
+    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), LAW_ERROR * found.shape * found.mean_ns)
+    hidden = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
+    return Curve(knots_x, level + best.weights, sigma), _trust(problem, best, at_x, points), hidden
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
@@ -198,30 +227,38 @@ def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoi
     return fitness.trust * ramp(fitness.load, 0.02, 0.04)
 
 
-def refine_epoch(x: Floats, y: Floats) -> Curve:
-    """The curve of one sync epoch from its samples in ascending order; a long one piece by piece."""
+def refine_epoch(x: Floats, y: Floats, prior: SlopePrior | None = None) -> Curve:
+    """The curve of one sync epoch from its samples in ascending order; a long one piece by piece.
+
+    prior: the slope as other epochs of the same clock tell it.
+    """
     pieces = min(int((x[-1] - x[0]) / (PIECE_S * S)), x.size // 1000) + 1
     if pieces == 1:
-        return _refine_piece(x, y)
+        return _refine_piece(x, y, prior)
     edges = np.linspace(x[0], x[-1], pieces + 1)
     knots_x = np.arange(x[0], x[-1] + SEAM_S * S, 0.1 * SEAM_S * S)
     heights, weights = np.zeros_like(knots_x), np.zeros_like(knots_x)
+    sigmas = []
     for left, right in pairwise(edges.tolist()):
         part = slice(*np.searchsorted(x, (left - SEAM_S * S, right + SEAM_S * S)).tolist())
         if part.stop - part.start < 2:
             continue
         inside = np.minimum(knots_x - left, right - knots_x) / (SEAM_S * S) + 1
         weight = np.clip(0.5 * inside, 1e-9, 1.0)
-        heights += weight * _refine_piece(x[part], y[part]).at(knots_x)
+        curve = _refine_piece(x[part], y[part], prior)
+        heights += weight * curve.at(knots_x)
         weights += weight
-    return Curve(knots_x, heights / weights)
+        sigmas.append(curve.sigma_ns)
+    return Curve(knots_x, heights / weights, max(sigmas))
 
 
-def _refine_piece(x: Floats, y: Floats) -> Curve:
-    beneath = envelope_by_data(x, y)
-    found = grid_curve(x, y, beneath)
-    if found is None or found[1] == 0.0:
+def _refine_piece(x: Floats, y: Floats, prior: SlopePrior | None) -> Curve:
+    beneath = envelope_by_data(x, y, prior)
+    found = grid_curve(x, y, beneath, prior)
+    if found is None:
         return beneath
-    curve, trust = found
+    curve, trust, hidden_ns = found
+    beneath = replace(beneath, sigma_ns=math.hypot(beneath.sigma_ns, hidden_ns))
     knots_x = np.union1d(curve.knots_x, beneath.knots_x)
-    return Curve(knots_x, trust * curve.at(knots_x) + (1 - trust) * beneath.at(knots_x))
+    heights = trust * curve.at(knots_x) + (1 - trust) * beneath.at(knots_x)
+    return Curve(knots_x, heights, trust * curve.sigma_ns + (1 - trust) * beneath.sigma_ns)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from recorder.clock import refine
+from recorder.clock import refine_all
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.raw import NONE
 
@@ -33,7 +33,6 @@ JUMP_SHARE = 500e-6  # and what a clock may gain meanwhile
 STEP_BACK_NS = 1_000_000_000  # less is reordering
 MIN_SEGMENT_ROWS = 4
 MAX_SHIFT_NS = 5_000_000_000  # a refined time further off than this is not believed: the online stamp stays
-HALVES_FACTOR = 0.5  # of the rms difference of two halves: sigma of the whole, as the error of a level goes with 1/n
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,12 +169,13 @@ def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int
     if len(group) > 1:  # one may be held up while the other is not: device time tells their order, arrival does not
         spans = np.concatenate([_spans(axes[table.device]) for table in group if len(table.heard)])
         order = np.lexsort((arrival_ns, axis, spans))
-    host_ns = np.zeros_like(axis)
+    host_ns, sigma_ns = np.zeros_like(axis), 0.0
     if axis.size:
         in_order = axis[order]
         is_first = np.diff(in_order, prepend=in_order[0] - 1) != 0  # of several messages of one instant, the quickest
-        quickest_ns = refine(in_order[is_first], arrival_ns[order][is_first], NS_PER_S)
-        host_ns[order] = quickest_ns[np.cumsum(is_first) - 1]
+        refined = refine_all(in_order[is_first], arrival_ns[order][is_first], NS_PER_S)
+        host_ns[order] = refined.host_ns[np.cumsum(is_first) - 1]
+        sigma_ns = float(np.sqrt(np.mean(refined.sigma_ns**2)))
     curves = _curves(axis[order], host_ns[order])
     times_ns = {}
     first = 0
@@ -187,7 +187,6 @@ def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int
     slope = 0.0
     if longest is not None and longest[0][-1] > longest[0][0]:
         slope = float(longest[1][-1] - longest[1][0]) / float(longest[0][-1] - longest[0][0])
-    sigma_ns = _uncertainty_ns(axis[order], arrival_ns[order], host_ns[order])
     return Refined(times_ns, sigma_ns, (1 / (1 + slope) - 1) * 1e6, max(len(curves), 1))
 
 
@@ -258,16 +257,3 @@ def _axis_near(table: DeviceTable, axis: Ints, unheard: Ints) -> Ints:
 def _likely(curves: list[tuple[Ints, Ints]]) -> Iterable[tuple[Ints, Ints]]:
     """The longest ones: garbage makes short ones without end."""
     return sorted(curves, key=lambda curve: -curve[0].size)[:32]
-
-
-def _uncertainty_ns(axis: Ints, arrival_ns: Ints, host_ns: Ints) -> float:
-    """One sigma of the refined times, from what two halves of the messages tell apart from each other."""
-    if axis.size < 40:
-        return float(np.median(arrival_ns - host_ns)) if axis.size else 0.0
-    differences = []
-    for half in (slice(0, None, 2), slice(1, None, 2)):
-        differences.append(refine(axis[half], arrival_ns[half], NS_PER_S) - host_ns[half])
-    size = min(len(part) for part in differences)
-    apart = (differences[0][:size] - differences[1][:size]).astype(np.float64)
-    usual = np.abs(apart) < JUMP_NS * 10
-    return HALVES_FACTOR * float(np.sqrt(np.mean(apart[usual] ** 2))) if usual.any() else 0.0

@@ -161,6 +161,7 @@ class Timebase:
             if now_ns >= clock.hold_until_ns:
                 if clock.is_new and clock.waiting:  # its first stamps are to know all that came
                     self._refit(clock)
+                    clock.map.settle()
                     clock.is_new = False
                 waiting, clock.waiting = clock.waiting, []
                 stamped.extend(self._stamp(*sample) for sample in waiting)
