@@ -142,11 +142,13 @@ class ScanSample:
 class ClockPairs:
     """Device ticks and host arrival of many messages that are no samples of their own (lidar packets).
 
-    ticks, arrival_ns: (n,) int64.
+    ticks, arrival_ns: (n,) int64. sent_ns: when the queries that these are answers to were sent, (n,) int64; with
+    them the least delay of the link becomes known.
     """
 
     ticks: npt.NDArray[np.int64]
     arrival_ns: npt.NDArray[np.int64]
+    sent_ns: npt.NDArray[np.int64] | None = None
 
 
 Sample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample | ClockPairs

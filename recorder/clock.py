@@ -368,29 +368,34 @@ class ClockMap:
             return self._estimator.host_many(device_ns)
         return self._estimator.host_ns(device_ns)
 
-    def observe_two_way(self, ticks: int, sent_ns: int, received_ns: int) -> None:
+    def observe_two_way(
+        self, ticks: int, sent_ns: int, received_ns: int, stream: ClockStream | None = None
+    ) -> None:
         """A query sent and its answer received with the device's ticks in between: bounds from both sides.
 
-        Does not move the stamps; tells how late they are by the least delay of the link (`floor_ns`).
+        They tell the least delay of the link (`floor_ns`), and stamps move earlier by it, at the usual rate. The pairs
+        with the shortest round trips count, like the best probes of NTP (RFC 5905, section 10). stream: whose ticks.
         """
-        if self._estimator.started and received_ns >= sent_ns:
-            late_ns = self.host_ns(self._stream.unwrap(ticks)) - (sent_ns + received_ns) // 2
-            self._two_way = [*self._two_way, (received_ns - sent_ns, late_ns)][-TWO_WAY_KEPT:]
+        estimator = self._estimator
+        if not estimator.started or received_ns < sent_ns:
+            return
+        x = (stream or self._stream).unwrap(ticks) - estimator.anchor_device
+        if abs(x) >= FAR:
+            return
+        late_ns = estimator.anchor_host + x + round(estimator.fit.at(x)) - (sent_ns + received_ns) // 2
+        self._two_way = [*self._two_way, (received_ns - sent_ns, late_ns)][-TWO_WAY_KEPT:]
+        shortest = min(self._two_way)[0]
+        floor_ns = float(np.median([late for trip, late in self._two_way if trip <= 1.2 * shortest]))
+        estimator.move_floor(max(floor_ns, 0.0))
 
     @property
     def floor_ns(self) -> int | None:
-        """How much later the stamps are than the events, from two-way pairs; None without any.
-
-        The pairs with the shortest round trips count, like the best probes of NTP (RFC 5905, section 10).
-        """
-        shortest = min(self._two_way, default=None)
-        if shortest is None:
-            return None
-        return round(float(np.median([late for trip, late in self._two_way if trip <= 1.2 * shortest[0]])))
+        """The least delay of the link from two-way pairs, taken off the stamps; None without any."""
+        return round(self._estimator.floor_ns) if self._two_way else None
 
     @property
     def floor_bound_ns(self) -> int | None:
-        """`floor_ns` cannot be further off than this, the line's own uncertainty apart: half a round trip."""
+        """`floor_ns` is not further off than this, the line's own uncertainty apart: half a round trip."""
         return min(self._two_way)[0] // 2 if self._two_way else None
 
     def host_suspended(self, duration_ns: int) -> None:
@@ -420,8 +425,9 @@ class ClockMap:
 
     @property
     def uncertainty_ns(self) -> float:
-        """One sigma of the stamps given now, apart from the constant floor of the delay."""
-        return math.hypot(self._estimator.sigma_ns(), 0.5 * self._stream.tick_ns)
+        """One sigma of the stamps given now; the least delay of the link is left out unless two-way pairs tell it."""
+        floor_ns = (self.floor_bound_ns or 0) / math.sqrt(3)
+        return math.hypot(self._estimator.sigma_ns(), 0.5 * self._stream.tick_ns, floor_ns)
 
     @property
     def skew_ppm(self) -> float:

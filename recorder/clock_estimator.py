@@ -133,6 +133,7 @@ class Estimator:
         self.anchor_device = 0
         self.anchor_host = 0
         self.zero_ns = 0  # added to device times; changes with the epoch so that the axis runs on
+        self.floor_ns = 0.0  # the least delay of the link, as far as known: what is put out lies so far below the fit
         self.line = SlewedLine(-math.inf, 0.0, prior.slope)
         self.fit = Line(0.0, prior.slope, prior.sigma, 1e6, 0.0)
         self.last_x = 0.0
@@ -174,7 +175,8 @@ class Estimator:
 
     def sigma_ns(self) -> float:
         """One sigma of what is put out now, floor of the delay apart."""
-        return self.fit.sigma_ns(self.last_x) + abs(self.line.at(self.last_x) - self.fit.at(self.last_x))
+        behind = self.line.at(self.last_x) + self.floor_ns - self.fit.at(self.last_x)
+        return self.fit.sigma_ns(self.last_x) + abs(behind)
 
     def early_limit_ns(self, x: float) -> float:
         """How far below the line an arrival at x may be and still be believed."""
@@ -194,11 +196,11 @@ class Estimator:
         self._past = [*self._past, self.line][-KEPT_EPOCHS:]
         sigma = min(max(KEPT_SKEW_PPM * PPM, fit.sd_slope), self._first_prior.sigma)
         self._begin(self.last_x, SlopePrior(fit.slope, sigma))
-        self.line = SlewedLine(self.last_x, fit.offset, fit.slope)
+        self.line = SlewedLine(self.last_x, fit.offset - self.floor_ns, fit.slope)
         self.fit = Line(fit.offset, fit.slope, sigma, self.fit.sd_level_ns, self.last_x)
 
     def _begin(self, x: float, prior: SlopePrior) -> None:
-        self.fit = Line(self.line.offset, prior.slope, prior.sigma, 1e6, x)
+        self.fit = Line(self.line.offset + self.floor_ns, prior.slope, prior.sigma, 1e6, x)
         self.early_ns = float(LATE_NS)
         self.last_x = x
         self.refit_due = False
@@ -249,7 +251,15 @@ class Estimator:
     def _lower(self, by_ns: float, x: float) -> None:
         """A point lies below the line: move it down at once, what is put out follows at its rate."""
         self.fit = self.fit.lowered(by_ns)
-        self.line = self.line.retarget(self.fit.offset, self.fit.slope, x, self._slew_rate())
+        self._aim(x)
+
+    def move_floor(self, floor_ns: float) -> None:
+        """The least delay is known, anew or for the first time: what is put out moves there at its rate."""
+        self.floor_ns = floor_ns
+        self._aim(self.last_x)
+
+    def _aim(self, x: float) -> None:
+        self.line = self.line.retarget(self.fit.offset - self.floor_ns, self.fit.slope, x, self._slew_rate())
 
     def _slew_rate(self) -> float:
         age_s = self._age_s()
@@ -321,7 +331,7 @@ class Estimator:
     def settle(self) -> None:
         """Nothing of this epoch has been put out yet: put out the newest line from the epoch's start on."""
         self._adopt()
-        self.line = SlewedLine(self.line.start_x, self.fit.offset, self.fit.slope)
+        self.line = SlewedLine(self.line.start_x, self.fit.offset - self.floor_ns, self.fit.slope)
 
     def _adopt(self) -> None:
         """Take over a finished refit, below what has come since."""
@@ -334,6 +344,6 @@ class Estimator:
             x, y = self._open_points()
             under = min(under, float((y - fit.offset - fit.slope * x).min()))
         self.fit = fit = fit.lowered(min(under, 0.0))
-        self.line = self.line.retarget(fit.offset, fit.slope, self.last_x, self._slew_rate())
+        self._aim(self.last_x)
         if self._age_s() > SETTLED_S:
             self.early_ns = min(EARLY_FLOOR_NS + 10 * fit.spread_ns, float(LATE_NS))

@@ -308,6 +308,7 @@ def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int, epochs: list
         resets=clock.resets,
         wraps=clock.wraps,
         by_epoch=epochs,
+        floor_us=None if clock.floor_ns is None else clock.floor_ns / 1e3,
     )
 
 

@@ -132,7 +132,9 @@ def _tables(folder: Path, manifest: Manifest) -> dict[str, DeviceTable]:
             tick_hz = device.tick_hz or (clock.tick_hz if clock else 0.0)
             wrap_bits = device.wrap_bits if device.tick_hz else (clock.wrap_bits if clock else 0)
             if tick_hz > 0:
-                tables[name] = load_table(path, name, tick_hz, wrap_bits, round(device.latency_s * NS_PER_S))
+                floor_us = (clock.floor_us or 0.0) if clock else 0.0
+                latency_ns = round(device.latency_s * NS_PER_S + floor_us * 1e3)
+                tables[name] = load_table(path, name, tick_hz, wrap_bits, latency_ns)
     if not tables:
         raise StorageError(f"{folder}: holds no clock tables (raw/DEVICE.clock), so its times cannot be refined")
     return tables

@@ -77,7 +77,10 @@ class EpochSummary(msgspec.Struct):
 
 
 class ClockSummary(msgspec.Struct):
-    """One device clock as the clock map saw it at the end."""
+    """One device clock as the clock map saw it at the end.
+
+    floor_us: the least delay of its link where two-way pairs told it; it is taken off the stamps.
+    """
 
     tick_hz: float
     wrap_bits: int
@@ -88,6 +91,7 @@ class ClockSummary(msgspec.Struct):
     resets: int
     wraps: int
     by_epoch: list[EpochSummary] = []
+    floor_us: float | None = None
 
 
 class UtcAtZero(msgspec.Struct):

@@ -159,6 +159,9 @@ def test_two_way_pairs_tell_the_floor() -> None:
         if i % 200 == 199:
             clock.observe_two_way(tick, true - 200_000, true + 100_000)
     assert clock.floor_ns is not None
+    stamps_ns = np.array([clock.host_ns(int(device_ns)) for device_ns in t.ticks[-200:] * 1000])
+    assert np.abs(stamps_ns - t.true_ns[-200:]).max() < 200_000
+    assert clock.uncertainty_ns > 50_000
     assert clock.floor_bound_ns == 150_000
     assert abs(clock.floor_ns - floor_ns) < 200_000
 

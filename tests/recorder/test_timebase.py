@@ -237,3 +237,20 @@ def test_samples_that_come_together_are_stamped_with_what_all_of_them_tell():
     stamped = timebase.release(START_NS + 3 * S)
     times = np.array([entry.host_ns for entry in stamped])
     assert np.abs(np.diff(times) - PERIOD_NS).max() < 10_000
+
+
+def test_two_way_pairs_move_the_stamps_by_the_least_delay() -> None:
+    floor_ns, step_ns = 2_000_000, 5_000_000
+    timebase = Timebase(0)
+    timebase.add_device("imu", "imu", 1e6, 0, 0)
+    stamped = []
+    for i in range(4000):
+        event_ns = i * step_ns
+        timebase.take("imu", event_ns + floor_ns, imu(event_ns // 1000))
+        if i % 200 == 100:
+            answers = np.array([event_ns // 1000]), np.array([event_ns + 3 * MS]), np.array([event_ns - 3 * MS])
+            timebase.take("imu", event_ns + 3 * MS, ClockPairs(*answers))
+        stamped += timebase.release(event_ns + floor_ns)
+    late_us = np.array([(s.host_ns - s.device_ns) / 1e3 for s in stamped if s.host_ns > 10**10])
+    assert np.abs(late_us).max() < 70
+    assert timebase.clocks()["imu"].epoch == 0
