@@ -29,7 +29,9 @@ VIDEOS = ("data.mkv", "data2.mkv")
 
 
 def numbers(path: Path) -> list[int]:
-    """Which pictures (modulo 36) a video shows, by PyAV."""
+    """Which pictures (modulo 36) a video shows, by PyAV; none before the first one."""
+    if not path.exists():
+        return []
     with av.open(str(path)) as container:
         levels = [float(np.mean(frame.to_ndarray(format="gray"))) for frame in container.decode(video=0)]
     return [round((level - 20) / 6) % 36 for level in levels]
@@ -83,6 +85,8 @@ def test_killed(tmp_path: Path, seed: int) -> None:
         shown = numbers(folder / name)
         assert len(shown) >= muxed[str(camera)] - 1
         assert shown[: len(lines)] == lines  # every line has its picture, without repair
+        if not shown:
+            continue
         assert count_by_opencv(folder / name) == len(shown)
         if shutil.which("ffprobe"):
             assert count_by_ffprobe(folder / name) == len(shown)
