@@ -106,8 +106,11 @@ class Pipeline:
             latency_ns = round(device.config.latency_s * NS_PER_S)
             prior = device.prior_skew_ppm
             self._timebase.add_device(device.name, device.clock, device.tick_hz, device.wrap_bits, latency_ns, prior)
-        cameras = sum(device.camera is not None for device in devices)
-        self._synchronizer: Synchronizer[Stamped, FrameSample] = Synchronizer(cameras, pair_within_ns)
+        cameras = sorted((device.camera, device.clock) for device in devices if device.camera is not None)
+        clocks = list(dict.fromkeys(clock for _, clock in cameras))
+        group_of = tuple(clocks.index(clock) for _, clock in cameras)
+        self._groups = [tuple(camera for camera, its in cameras if its == clock) for clock in clocks]
+        self._synchronizer: Synchronizer[Stamped, FrameSample] = Synchronizer(len(cameras), pair_within_ns, group_of)
         self._tables = {device.name: _ClockTable() for device in devices}
         self._last_pairs_ns = self._last_log_ns = start_ns
         self._judged: set[str] = set()  # clocks of which was told what they show
@@ -252,7 +255,8 @@ class Pipeline:
     def _write(self, released: list[Released[Stamped, FrameSample]]) -> None:
         for entry in released:
             if isinstance(entry.item, FrameSet):
-                self._writer.write_frames(entry.time_ns, entry.item.pictures, late=entry.late)
+                cameras = self._groups[entry.item.group]
+                self._writer.write_frames(entry.time_ns, entry.item.pictures, late=entry.late, cameras=cameras)
                 self._count_late_pictures(entry)
             else:
                 summary = self._devices[entry.item.device].summary

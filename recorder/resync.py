@@ -28,7 +28,7 @@ from drivers.samples import POINT_DTYPE
 from recorder.errors import StorageError, StorageFullError
 from recorder.recording.check_data import path_inside
 from recorder.recording.folder import free_bytes, link_or_copy, low_water_bytes
-from recorder.recording.jsonl import DATA_NAME, encode_json
+from recorder.recording.jsonl import DATA_NAME, encode_json, frames_of
 from recorder.recording.lidar import FOLDER as LIDAR_FOLDER
 from recorder.recording.manifest import (
     MANIFEST_NAME,
@@ -346,7 +346,7 @@ class _Rewriting:
         self._folder = folder
         self._target = target
         self._tables, self._refined_ns, self._former_ns = tables, times_ns, former_ns
-        kinds = {name: device.stream.kind for name, device in manifest.devices.items() if name in tables}
+        kinds = {name: _line_kind(manifest, name) for name in manifest.devices if name in tables}
         self._times = {
             kind: self._line_times(kind, [name for name, its in kinds.items() if its == kind], manifest.cameras)
             for kind in set(kinds.values())
@@ -355,12 +355,13 @@ class _Rewriting:
         self._last_scan_ns: dict[str, int] = {}
 
     def _line_times(self, kind: str, devices: list[str], cameras: list[str]) -> _LineTimes:
-        if kind == "frames":
+        is_video = kind.startswith(("frames", "extraFrames"))
+        if is_video:
             devices = sorted(devices, key=lambda name: cameras.index(name) if name in cameras else len(cameras))
         chosen = {name: self._line_rows(kind, name) for name in devices}
         online_ns = np.concatenate([self._tables[name].stamped[rows, 2] for name, rows in chosen.items()])
         times_ns = np.concatenate([self._refined_ns[name][rows] for name, rows in chosen.items()])
-        if kind == "frames":  # all pictures of a set have its stamp: the first camera's row counts
+        if is_video:  # all pictures of a set have its stamp: the first camera's row counts
             online_ns, first = np.unique(online_ns, return_index=True)
             return _LineTimes(online_ns, ascending(online_ns, times_ns[first], FRAME_STEP_NS))
         if kind == "lidar":
@@ -417,7 +418,7 @@ class _Rewriting:
 
     def _write(self, time_ns: int, _number: int, line: dict[str, Any]) -> int:
         moved_ns = time_ns - round(line["time"] * NS_PER_S)
-        for entry in line.get("frames", ()):
+        for entry in frames_of(line):
             entry["time"] = (round(entry["time"] * NS_PER_S) + moved_ns) / NS_PER_S
         line["time"] = time_ns / NS_PER_S
         self._target.write_line(encode_json(line))
@@ -468,10 +469,22 @@ class _Rewriting:
         return time_ns
 
 
+def _line_kind(manifest: Manifest, device: str) -> str:
+    """Kind of the lines of a device; cameras on another clock than the first one have their own."""
+    summary = manifest.devices[device]
+    if summary.stream.kind != "frames" or device not in manifest.cameras:
+        return summary.stream.kind
+    first = next(index for index, name in enumerate(manifest.cameras) if manifest.devices[name].clock == summary.clock)
+    return f"extraFrames{first}" if first else "frames"
+
+
 def _kind(line: dict[str, Any]) -> tuple[str, str]:
     """Kind of device that a line is of, and its stream's name."""
     if "sensor" in line:
         return "imu", line["sensor"]["type"]
+    if "extraFrames" in line:
+        name = f"extraFrames{line['extraFrames'][0]['cameraInd']}"
+        return name, name
     for key, kind in (("frames", "frames"), ("gps", "gnss"), ("lidar", "lidar")):
         if key in line:
             return kind, kind

@@ -107,15 +107,10 @@ def record(
 
 
 def _cameras(rig: Rig, drivers: dict[str, Driver]) -> list[RigDevice]:
-    """Camera devices in the order of their index. All must be on one clock, as they make one frame set."""
+    """Camera devices in the order of their index: first all on the clock of the first one, then the other clocks'."""
     cameras = [device for device in rig.devices if drivers[device.name].streams[0].kind == "frames"]
-    if len({camera.clock for camera in cameras}) > 1:
-        clocks = ", ".join(f"{camera.name} on {camera.clock}" for camera in cameras)
-        raise ConfigError(
-            f"cameras can be recorded together only when one clock stamps them ({clocks}); "
-            "give synchronised cameras the same `clock: NAME`"
-        )
-    return cameras
+    clocks = list(dict.fromkeys(camera.clock for camera in cameras))
+    return sorted(cameras, key=lambda camera: clocks.index(camera.clock))
 
 
 def _calibration(rig: Rig, cameras: list[RigDevice]) -> bytes | None:
@@ -132,6 +127,7 @@ def _calibration(rig: Rig, cameras: list[RigDevice]) -> bytes | None:
 
 
 def _too_few(calibration: Calibration, cameras: list[RigDevice]) -> list[str]:
+    cameras = [camera for camera in cameras if camera.clock == cameras[0].clock]  # clients take these
     if len(calibration.cameras) >= len(cameras):
         return []
     names = ", ".join(camera.name for camera in cameras)

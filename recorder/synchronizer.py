@@ -19,11 +19,12 @@ ORDER_STEP_NS = 1000
 class FrameSet(Generic[P]):
     """The pictures that cameras of one clock took at one instant; None where a camera's picture is not there.
 
-    device_ns: instant on the cameras' clock. pictures: by camera index.
+    device_ns: instant on the cameras' clock. pictures: by camera index, None also for cameras of other groups.
     """
 
     device_ns: int
     pictures: list[P | None]
+    group: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +40,18 @@ class Released(Generic[T, P]):
 class Synchronizer(Generic[T, P]):
     """T: items of all streams but pictures; P: pictures.
 
-    cameras: how many cameras make a frame set. pair_within_ns: pictures of one set differ less than this in
-    device time (half a frame period).
+    cameras: how many there are. pair_within_ns: pictures of one set differ less than this in device time (half a
+    frame period). group_of: by camera, which group it is in: those of one clock make frame sets; default: all do.
     """
 
     cameras: int
     pair_within_ns: int
+    group_of: tuple[int, ...] = ()
     _heap: list[tuple[int, int, "T | FrameSet[P]"]] = field(default_factory=list)
     _sequence: int = 0
     _watermark_ns: int | None = None
     _open_sets: deque[tuple[int, FrameSet[P]]] = field(default_factory=deque)
-    _given_out: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SETS))
+    _given_out: deque[tuple[int, int, int]] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SETS))
 
     def add(self, time_ns: int, item: T) -> None:
         """Take an item of any stream but cameras."""
@@ -60,32 +62,33 @@ class Synchronizer(Generic[T, P]):
 
         Gives the time of its frame set.
         """
+        group = self.group_of[camera] if self.group_of else 0
         for set_time_ns, frame_set in reversed(self._open_sets):
-            if abs(frame_set.device_ns - device_ns) < self.pair_within_ns:
+            if frame_set.group == group and abs(frame_set.device_ns - device_ns) < self.pair_within_ns:
                 if frame_set.pictures[camera] is None:
                     frame_set.pictures[camera] = picture
                     return set_time_ns
                 break  # a second picture of one camera within half a period: kept as a set of its own
-        frame_set = FrameSet(device_ns, [None] * self.cameras)
+        frame_set = FrameSet(device_ns, [None] * self.cameras, group)
         frame_set.pictures[camera] = picture
-        for given_device_ns, given_time_ns in reversed(self._given_out):
-            if abs(given_device_ns - device_ns) < self.pair_within_ns:
+        for given_group, given_device_ns, given_time_ns in reversed(self._given_out):
+            if given_group == group and abs(given_device_ns - device_ns) < self.pair_within_ns:
                 time_ns = given_time_ns  # its partner went out without it: same instant, same time
                 break
         else:
-            time_ns = self._between_neighbours(device_ns, time_ns)
+            time_ns = self._between_neighbours(group, device_ns, time_ns)
         self._open_sets.append((time_ns, frame_set))
         self._push(time_ns, frame_set)
         return time_ns
 
-    def _between_neighbours(self, device_ns: int, time_ns: int) -> int:
-        """Keep sets in the order of their device times, which mapped times of two cameras may contradict.
+    def _between_neighbours(self, group: int, device_ns: int, time_ns: int) -> int:
+        """Keep sets of a group in the order of their device times, which mapped times of two cameras may contradict.
 
         While a clock is not known well yet, one camera's late pictures are mapped later than the other's next ones;
         an encoded picture written before its forerunner could not be decoded.
         """
-        sets = [(frame_set.device_ns, set_time_ns) for set_time_ns, frame_set in self._open_sets]
-        sets += self._given_out
+        sets = [(its.device_ns, set_time_ns) for set_time_ns, its in self._open_sets if its.group == group]
+        sets += [(given_ns, given_time_ns) for its, given_ns, given_time_ns in self._given_out if its == group]
         before_ns = max((other_ns for other, other_ns in sets if other <= device_ns), default=None)
         after_ns = min((other_ns for other, other_ns in sets if other > device_ns), default=None)
         if before_ns is not None and time_ns <= before_ns:
@@ -113,7 +116,7 @@ class Synchronizer(Generic[T, P]):
 
     def _close_set(self, time_ns: int, closed: FrameSet[P]) -> None:
         self._open_sets = deque(entry for entry in self._open_sets if entry[1] is not closed)
-        self._given_out.append((closed.device_ns, time_ns))
+        self._given_out.append((closed.group, closed.device_ns, time_ns))
 
     def flush(self) -> list[Released[T, P]]:
         """All that is left, in time order: the end of a take."""

@@ -15,7 +15,7 @@ from rich.table import Column, Table
 
 from calibration.model import Calibration, CalibrationError, load_calibration, validate
 from recorder.recording.check_data import DataCheck, Finding, Findings, Progress, file_size, path_inside
-from recorder.recording.manifest import EVENTS_NAME, MANIFEST_NAME, Manifest, read_manifest
+from recorder.recording.manifest import EVENTS_NAME, MANIFEST_NAME, Manifest, main_cameras, read_manifest
 from recorder.recording.reader import DATA_NAME, MAX_LINE_BYTES, StreamStats, VideoStats, find_videos, read_video
 
 CALIBRATION_NAME = "calibration.json"
@@ -116,8 +116,8 @@ def _check_calibration(folder: Path, manifest: Manifest | None, findings: Findin
         findings.add("error", "calibration", CALIBRATION_NAME, text)
         return None
     findings.add_each("error", "calibration", CALIBRATION_NAME, validate(calibration))
-    if manifest and len(calibration.cameras) < len(manifest.cameras):
-        text = f"has {len(calibration.cameras)} cameras, the recording has {len(manifest.cameras)}"
+    if manifest and len(calibration.cameras) < main_cameras(manifest):
+        text = f"has {len(calibration.cameras)} cameras, the recording has {main_cameras(manifest)}"
         findings.add("error", "calibration-cameras", CALIBRATION_NAME, text)
     return calibration
 

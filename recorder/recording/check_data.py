@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import UNSET
 
 from drivers.samples import POINT_DTYPE
-from recorder.recording.manifest import Manifest
+from recorder.recording.manifest import Manifest, main_cameras
 from recorder.recording.reader import DATA_NAME, BadLine, FrameEntry, Gps, LidarEntry, Line, Streams, read_lines
 
 Severity = Literal["error", "warning", "note"]
@@ -77,19 +77,21 @@ class DataCheck:
     def __init__(
         self, folder: Path, camera_count: int | None, manifest: Manifest | None, findings: Findings, deep: bool
     ) -> None:
-        """camera_count: cameras that every frames line must list; None: as many as the first one does."""
+        """camera_count: cameras of the recording; None: as many as the first frames line lists."""
         self._expected_hz = _expected_rates(manifest)
         self.streams = Streams(self._expected_hz)
         self.pictures: Counter[int] = Counter()
         self.scan_files: set[str] = set()
         self.pose_streams: set[str] = set()
         self.camera_count = camera_count
+        self._main_cameras = main_cameras(manifest) if manifest else None
         self._folder = folder
         self._findings = findings
         self._deep = deep
         # Files of other programs may do what the clients put up with; ours promise more.
         self._strict: Severity = "error" if manifest else "warning"
         self._next_number = 0
+        self._next_extra: Counter[int] = Counter()
 
     def run(self, progress: Progress) -> None:
         """Read the file; progress is called with the part that is done."""
@@ -126,6 +128,8 @@ class DataCheck:
                 stats.add_vector(values)
         elif line.frames is not UNSET:
             self._check_frames(number, line.frames, line, time_s)
+        elif line.extra_frames is not UNSET:
+            self._check_extra_frames(number, line.extra_frames, line, time_s)
         elif line.gps is not UNSET:
             self._check_gps(number, line.gps)
         elif line.lidar is not UNSET:
@@ -144,8 +148,9 @@ class DataCheck:
         if self.camera_count is None:
             self.camera_count = len(frames)
         cameras = sorted(entry.camera_ind for entry in frames)
-        if cameras != list(range(self.camera_count)):
-            text = f"frames of cameras {cameras}, expected all of 0..{self.camera_count - 1}"
+        expected = self.camera_count if self._main_cameras is None else self._main_cameras
+        if cameras != list(range(expected)):
+            text = f"frames of cameras {cameras}, expected all of 0..{expected - 1}"
             self._fault("error", "frame-cameras", number, text)
         if frames and frames[0].time not in (UNSET, time_s):
             text = f"frames[0].time {frames[0].time} is not the line's time {time_s}; clients differ in which they take"
@@ -153,6 +158,24 @@ class DataCheck:
         for entry in frames:
             if not entry.missing_bitmap and entry.camera_ind in range(self.camera_count):
                 self.pictures[entry.camera_ind] += 1
+
+    def _check_extra_frames(self, number: int, frames: list[FrameEntry], line: Line, time_s: float) -> None:
+        """Lines of cameras that are on another clock than the first one; clients pass them over."""
+        cameras = sorted(entry.camera_ind for entry in frames)
+        allowed = range(self._main_cameras or 0, self.camera_count or 0)
+        if not cameras or not set(cameras) <= set(allowed):
+            text = f"extraFrames of cameras {cameras}, expected some of {list(allowed)}"
+            return self._fault("error", "frame-cameras", number, text)
+        if line.number != self._next_extra[cameras[0]]:
+            text = f"extraFrames number {line.number}, expected {self._next_extra[cameras[0]]}"
+            self._fault(self._strict, "frame-number", number, text)
+        self._next_extra[cameras[0]] += 1
+        for entry in frames:
+            if entry.time not in (UNSET, time_s):
+                text = f"extraFrames time {entry.time} is not the line's time {time_s}"
+                self._fault(self._strict, "frame-time", number, text)
+            self.pictures[entry.camera_ind] += not entry.missing_bitmap
+        return None
 
     def _check_gps(self, number: int, gps: Gps) -> None:
         if not (-90 <= gps.latitude <= 90 and -180 <= gps.longitude <= 180):
@@ -206,8 +229,12 @@ def _expected_rates(manifest: Manifest | None) -> dict[str, float]:
         return rates
     for kind, streams in STREAMS_OF_KIND.items():
         devices = [device.stream for device in manifest.devices.values() if device.stream.kind == kind]
-        if devices and devices[0].rate_hz and (len(devices) == 1 or kind == "frames"):
+        if kind != "frames" and len(devices) == 1 and devices[0].rate_hz:
             rates |= dict.fromkeys(streams, devices[0].rate_hz)
+    for index, name in enumerate(manifest.cameras):
+        rate_hz = manifest.devices[name].stream.rate_hz if name in manifest.devices else None
+        if rate_hz:
+            rates[f"extraFrames{index}" if index else "frames"] = rate_hz
     return rates
 
 

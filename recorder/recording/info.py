@@ -133,7 +133,11 @@ def _read_data(folder: Path) -> tuple[Streams, LidarInfo, int]:
 def _stream_infos(streams: Streams, manifest: Manifest | None) -> list[StreamInfo]:
     infos = []
     for name, stats in sorted(streams.by_name.items()):
-        kind = KIND_OF_STREAM.get(name, "imu" if name in ("magnetometer", "imuTemperature") else "pose")
+        kind = (
+            "frames"
+            if name.startswith("extraFrames")
+            else KIND_OF_STREAM.get(name, "imu" if name in ("magnetometer", "imuTemperature") else "pose")
+        )
         entry = StreamInfo(name, kind, stats.count, stats.rate_hz, stats.first_s, stats.last_s)
         if manifest:
             sources = [device.stream for device in manifest.devices.values() if device.stream.kind == kind]

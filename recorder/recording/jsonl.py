@@ -10,7 +10,7 @@ within `lidar`.
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,9 +59,20 @@ class FrameEntry(msgspec.Struct, omit_defaults=True):
 
 
 class FramesLine(msgspec.Struct):
-    """One frame set: an entry for every camera."""
+    """One frame set: an entry for every camera on the clock of camera 0."""
 
     frames: list[FrameEntry]
+    number: int
+    time: float
+
+
+class ExtraFramesLine(msgspec.Struct):
+    """One frame set of cameras on another clock than camera 0.
+
+    Clients pass the key over. They lose track when `frames` lines of their own cameras have others' in between.
+    """
+
+    extraFrames: list[FrameEntry]  # noqa: N815
     number: int
     time: float
 
@@ -83,10 +94,14 @@ class PendingPicture:
 
 @dataclass(frozen=True, slots=True)
 class PendingFrames:
-    """A frames line to be: it is numbered and written when all its pictures are in their files (or failed)."""
+    """A frames line to be: it is numbered and written when all its pictures are in their files (or failed).
+
+    cameras: index of each picture's camera (default: all in their order).
+    """
 
     time_ns: int
     pictures: tuple[PendingPicture, ...]
+    cameras: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +193,7 @@ class LineWriter:
     def __init__(self, folder: Path, on_error: Callable[[str, Exception], None]) -> None:
         """Create data.jsonl; it must not exist."""
         self.written_lines = 0
-        self.frames_written = 0
+        self._numbers: Counter[int] = Counter()  # by the first camera of a set
         self._folder = folder
         self._file = HashedFile(folder / DATA_NAME)
         self._late_file: HashedFile | None = None
@@ -223,12 +238,15 @@ class LineWriter:
         if isinstance(pending, PendingScan):
             return pending.line if pending.ticket.state == "done" else None
         time_s = pending.time_ns / NS_PER_S
-        entries = [picture.entry(index, time_s) for index, picture in enumerate(pending.pictures)]
+        cameras = pending.cameras or range(len(pending.pictures))
+        pairs = zip(cameras, pending.pictures, strict=True)
+        entries = [picture.entry(camera, time_s) for camera, picture in pairs]
         if all(entry.missingBitmap for entry in entries):
             return None
-        line = encode_json(FramesLine(entries, self.frames_written, time_s))
-        self.frames_written += 1
-        return line
+        first = cameras[0]
+        number = self._numbers[first]
+        self._numbers[first] += 1
+        return encode_json((ExtraFramesLine if first else FramesLine)(entries, number, time_s))
 
     def _failed(self, name: str, error: Exception) -> None:
         """Nothing can be written any more: empty the queue, so that nobody waits for room."""
@@ -270,17 +288,30 @@ def merge_late_lines(folder: Path) -> FileEntry:
     late = sorted(_decoded_lines(late_path), key=lambda entry: entry[0])
     merged_path = folder / (DATA_NAME + ".tmp")
     merged = HashedFile(merged_path)
-    number = 0
+    numbers: Counter[int] = Counter()
     for line in joined_frames(_merged(_decoded_lines(data_path), iter(late))):
-        if "frames" in line:
-            line["number"] = number
-            number += 1
+        number_frames(line, numbers)
         merged.write(encode_json(line) + b"\n")
     entry = merged.close()
     merged_path.replace(data_path)
     late_path.unlink()
     sync_folder(folder)
     return entry
+
+
+def frames_of(line: dict[str, Any]) -> list[dict[str, Any]]:
+    """The entries of a frames line of either kind; none of other lines."""
+    entries: list[dict[str, Any]] = line.get("frames") or line.get("extraFrames") or []
+    return entries
+
+
+def number_frames(line: dict[str, Any], numbers: "Counter[int]") -> None:
+    """Number a frames line anew. numbers: how many there were, by the first camera of their sets."""
+    entries = frames_of(line)
+    if entries:
+        first = entries[0]["cameraInd"]
+        line["number"] = numbers[first]
+        numbers[first] += 1
 
 
 def _decoded_lines(path: Path) -> Iterator[tuple[float, dict[str, Any]]]:
@@ -311,14 +342,19 @@ def joined_frames(lines: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         if held and line["time"] != held[0]["time"]:
             yield from held
             held = []
-        partner = next((other for other in reversed(held) if "frames" in other), None)
-        if partner is not None and "frames" in line and _fill_missing(partner["frames"], line["frames"]):
+        cameras = _cameras_of(line)
+        partner = next((other for other in reversed(held) if cameras and _cameras_of(other) == cameras), None)
+        if partner is not None and _fill_missing(frames_of(partner), frames_of(line)):
             continue
-        if held or "frames" in line:
+        if held or cameras:
             held.append(line)
         else:
             yield line
     yield from held
+
+
+def _cameras_of(line: dict[str, Any]) -> list[int]:
+    return [entry["cameraInd"] for entry in frames_of(line)]
 
 
 def _fill_missing(entries: list[dict[str, Any]], late_entries: list[dict[str, Any]]) -> bool:

@@ -179,6 +179,20 @@ class Manifest(msgspec.Struct, kw_only=True):
     files: dict[str, FileEntry] = {}
 
 
+def camera_groups(manifest: Manifest) -> list[tuple[int, ...]]:
+    """Cameras by index, those of one clock together: the first group is in `frames` lines, others in `extraFrames`."""
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(manifest.cameras):
+        clock = manifest.devices[name].clock if name in manifest.devices else ""
+        groups.setdefault(clock, []).append(index)
+    return [tuple(group) for group in groups.values()]
+
+
+def main_cameras(manifest: Manifest) -> int:
+    """How many cameras are on the clock of the first one."""
+    return len(camera_groups(manifest)[0]) if manifest.cameras else 0
+
+
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write recording.json whole or not at all (temporary file, fsync, rename)."""
     write_atomically(folder / MANIFEST_NAME, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")

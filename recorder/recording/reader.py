@@ -88,6 +88,7 @@ class Line(msgspec.Struct, rename="camel"):
     time: float | UnsetType = UNSET
     sensor: Sensor | UnsetType = UNSET
     frames: list[FrameEntry] | UnsetType = UNSET
+    extra_frames: list[FrameEntry] | UnsetType = UNSET
     number: int | UnsetType = UNSET
     gps: Gps | UnsetType = UNSET
     fix: msgspec.Raw | UnsetType = UNSET
@@ -104,8 +105,8 @@ class BadLine(msgspec.Struct):
 def read_lines(path: Path) -> Iterator[tuple[int, int, str, Line | BadLine]]:
     """Yield (line number from 1, byte offset, stream, line) of a data.jsonl. Raises OSError.
 
-    stream: the sensor's type, frames, gps, lidar or the name of the pose; "" for lines of no stream, which may
-    lack `time`, and for bad ones.
+    stream: the sensor's type, frames, extraFrames2 (by the first camera in it), gps, lidar or the name of the pose; ""
+    for lines of no stream, which may lack `time`, and for bad ones.
     """
     decode = msgspec.json.Decoder(Line).decode
     number = offset = 0
@@ -129,6 +130,8 @@ def read_lines(path: Path) -> Iterator[tuple[int, int, str, Line | BadLine]]:
 def _other_stream(line: Line, raw: bytes) -> str:
     if line.frames is not UNSET:
         return "frames"
+    if line.extra_frames is not UNSET:
+        return f"extraFrames{line.extra_frames[0].camera_ind}" if line.extra_frames else "extraFrames"
     if line.gps is not UNSET:
         return "gps"
     if line.lidar is not UNSET:

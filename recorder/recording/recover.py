@@ -29,6 +29,7 @@ from recorder.recording.manifest import (
     EVENTS_NAME,
     MANIFEST_NAME,
     Manifest,
+    camera_groups,
     read_manifest,
     sync_folder,
     write_atomically,
@@ -90,7 +91,8 @@ class _Recovery:
 
     def run(self) -> Recovered:
         """All of it."""
-        data = DataSurvey(len(self._videos))
+        groups = camera_groups(self._manifest)
+        data = DataSurvey(groups)
         self._back_up()
         late = list(data.read(self._source / LATE_NAME))
         data.count(merged_lines(data.read(self._source / DATA_NAME), late, []))
@@ -102,7 +104,7 @@ class _Recovery:
             raise StorageError(f"{self._folder}: nothing to save: no line of it reached the disk")
         self._tell_data(data, made, late)
         rewriting = Rewriting(surveys, scans)
-        again = DataSurvey(len(self._videos))  # the faults are counted already
+        again = DataSurvey(groups)  # the faults are counted already
         lines = merged_lines(again.read(self._source / DATA_NAME), late, made)
         temporary = self._folder / f"{DATA_NAME}.tmp"
         rewriting.run(lines, temporary)

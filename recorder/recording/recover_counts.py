@@ -50,7 +50,7 @@ def count_recording(folder: Path, events: Path, manifest: Manifest) -> None:
         if isinstance(line, BadLine) or line.time is UNSET or not stream:
             continue
         times[stream].append(round(line.time * NS_PER_S))
-        for entry in () if line.frames is UNSET else line.frames:
+        for entry in line.frames or line.extra_frames or ():
             pictures[entry.camera_ind] += not entry.missing_bitmap
     times_ns = {stream: np.frombuffer(found, np.int64) for stream, found in times.items()}
     manifest.duration_s = max((int(found.max()) for found in times_ns.values()), default=0) / NS_PER_S
@@ -72,9 +72,11 @@ def count_recording(folder: Path, events: Path, manifest: Manifest) -> None:
 
 def _count_lines(folder: Path, manifest: Manifest, stream: str, times_ns: Ints) -> None:
     """Tell whose lines those of a stream are; where several devices can be, by the stamps in their clock tables."""
-    kind = "imu" if stream in SENSORS else {"gps": "gnss", "lidar": "lidar", "frames": "frames"}.get(stream, "pose")
+    kind = "imu" if stream in SENSORS else {"gps": "gnss", "lidar": "lidar"}.get(stream, "pose")
+    if stream.startswith(("frames", "extraFrames")):
+        return
     devices = [name for name, device in manifest.devices.items() if device.stream.kind == kind]
-    if kind == "frames" or not devices:
+    if not devices:
         return
     is_open = np.ones(len(times_ns), bool)
     counts: dict[str, int] = {}

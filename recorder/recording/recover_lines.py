@@ -11,6 +11,7 @@ of the picture before. So a picture, or a line, that is gone from the middle put
 """
 
 import heapq
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recorder.recording.jsonl import encode_json, joined_frames
+from recorder.recording.jsonl import encode_json, frames_of, joined_frames, number_frames
 from recorder.recording.manifest import NS_PER_S, FileEntry
 from recorder.recording.reader import MAX_LINE_BYTES
 from recorder.recording.recover_video import VideoSurvey
@@ -35,11 +36,11 @@ Line = dict[str, Any]
 class DataSurvey:
     """What the lines on disk say.
 
-    stamps_ms: by camera, those that the pictures of its lines have; scans: files named; cut: lines broken off at the
-    end of a file; damaged: those elsewhere.
+    groups: cameras that make frame sets together. stamps_ms: by camera, those that the pictures of its lines have;
+    scans: files named; cut: lines broken off at the end of a file; damaged: those elsewhere.
     """
 
-    cameras: int
+    groups: list[tuple[int, ...]]
     lines: int = 0
     stamps_ms: list[set[int]] = field(init=False)
     scans: set[str] = field(default_factory=set)
@@ -48,15 +49,15 @@ class DataSurvey:
     damaged: int = 0
 
     def __post_init__(self) -> None:
-        self.stamps_ms = [set() for _ in range(self.cameras)]
+        self.stamps_ms = [set() for group in self.groups for _ in group]
 
     def count(self, lines: Iterable[Line]) -> None:
         """Take all lines in."""
-        last_ms = [-1] * self.cameras
+        last_ms = [-1] * len(self.stamps_ms)
         for line in lines:
             self.lines += 1
-            if "frames" in line:
-                for entry in line["frames"]:
+            if frames_of(line):
+                for entry in frames_of(line):
                     if not entry.get("missingBitmap", False):
                         last_ms[entry["cameraInd"]] = stamp_ms = _stamp_ms(line["time"], last_ms[entry["cameraInd"]])
                         self.stamps_ms[entry["cameraInd"]].add(stamp_ms)
@@ -89,7 +90,8 @@ class DataSurvey:
         try:
             line = msgspec.json.decode(text, type=Line)
             float(line["time"])
-            if "frames" in line and sorted(entry["cameraInd"] for entry in line["frames"]) != list(range(self.cameras)):
+            cameras = tuple(sorted(entry["cameraInd"] for entry in frames_of(line)))
+            if cameras not in (self.groups if "frames" in line or "extraFrames" in line else [()]):
                 return None
             if "lidar" in line:
                 str(line["lidar"]["dataFile"])
@@ -123,13 +125,17 @@ def _without_doubles(lines: Iterator[Line]) -> Iterator[Line]:
 
 def _holds(one: Line, other: Line) -> bool:
     """Whether a line makes another of the same time needless."""
-    if "frames" in one and "frames" in other:
+    if frames_of(one) and frames_of(other) and _cameras(one) == _cameras(other):
         return _shown(other) <= _shown(one)
     return one == other
 
 
 def _shown(line: Line) -> set[int]:
-    return {entry["cameraInd"] for entry in line["frames"] if not entry.get("missingBitmap")}
+    return {entry["cameraInd"] for entry in frames_of(line) if not entry.get("missingBitmap")}
+
+
+def _cameras(line: Line) -> set[int]:
+    return {entry["cameraInd"] for entry in frames_of(line)}
 
 
 def made_frames(
@@ -139,26 +145,28 @@ def made_frames(
 
     stamps_ns: by camera, the times of its frame sets as its clock table has them; the container's stamp tells which.
     """
-    sets: dict[int, set[int]] = {}
+    sets: dict[tuple[int, tuple[int, ...]], set[int]] = {}
     without = [0] * len(surveys)
-    for camera, survey in enumerate(surveys):
-        known = {stamp_ns // NS_PER_MS: stamp_ns for stamp_ns in np.unique(stamps_ns[camera]).tolist()}
-        for stamp_ms, is_good in zip(survey.time_ms, survey.is_good, strict=True):
-            if not is_good or stamp_ms in data.stamps_ms[camera]:
-                continue
-            if stamp_ms in known:
-                sets.setdefault(known[stamp_ms], set()).add(camera)
-            else:
-                without[camera] += 1
-    lines: list[Line] = []
-    for time_ns, cameras in sorted(sets.items()):
-        time_s = time_ns / NS_PER_S
-        entries: list[Line] = [{"cameraInd": camera, "time": time_s} for camera in range(len(surveys))]
-        for entry in entries:
-            if entry["cameraInd"] not in cameras:
-                entry["missingBitmap"] = True
-        lines.append({"frames": entries, "number": 0, "time": time_s})
-    return lines, without
+    for group in data.groups:
+        for camera in group:
+            known = {stamp_ns // NS_PER_MS: stamp_ns for stamp_ns in np.unique(stamps_ns[camera]).tolist()}
+            for stamp_ms, is_good in zip(surveys[camera].time_ms, surveys[camera].is_good, strict=True):
+                if not is_good or stamp_ms in data.stamps_ms[camera]:
+                    continue
+                if stamp_ms in known:
+                    sets.setdefault((known[stamp_ms], group), set()).add(camera)
+                else:
+                    without[camera] += 1
+    return [_made_line(time_ns, group, cameras) for (time_ns, group), cameras in sorted(sets.items())], without
+
+
+def _made_line(time_ns: int, group: tuple[int, ...], cameras: set[int]) -> Line:
+    time_s = time_ns / NS_PER_S
+    entries: list[Line] = [{"cameraInd": camera, "time": time_s} for camera in group]
+    for entry in entries:
+        if entry["cameraInd"] not in cameras:
+            entry["missingBitmap"] = True
+    return {"extraFrames" if group[0] else "frames": entries, "number": 0, "time": time_s}
 
 
 @dataclass(slots=True)
@@ -174,7 +182,7 @@ class Rewriting:
     keep: list[bytearray] = field(init=False)
     marked: int = 0
     scans_gone: int = 0
-    _number: int = 0
+    _numbers: Counter[int] = field(default_factory=Counter)
     _next: list[int] = field(init=False)
     _last_ms: list[int] = field(init=False)
     _is_broken: list[bool] = field(init=False)
@@ -198,16 +206,16 @@ class Rewriting:
         if "lidar" in line and line["lidar"]["dataFile"] not in self.scans:
             self.scans_gone += 1
             return False
-        if "frames" not in line:
+        entries = frames_of(line)
+        if not entries:
             return True
-        for entry in line["frames"]:
+        for entry in entries:
             if not entry.get("missingBitmap", False) and not self._has_picture(entry["cameraInd"], line["time"]):
                 entry["missingBitmap"] = True
                 self.marked += 1
-        if all(entry.get("missingBitmap", False) for entry in line["frames"]):
+        if all(entry.get("missingBitmap", False) for entry in entries):
             return False
-        line["number"] = self._number
-        self._number += 1
+        number_frames(line, self._numbers)
         return True
 
     def _has_picture(self, camera: int, time_s: float) -> bool:

@@ -155,14 +155,27 @@ class RecordingWriter:
         name, ticket = self._scans.put(points)
         self._lines.put(PendingScan(ticket, lidar_line(time_ns, model, name, scan)), late=late)
 
-    def write_frames(self, time_ns: int, pictures: Sequence[FrameSample | None], *, late: bool = False) -> None:
-        """A frame set: one picture per camera, None where it is not there."""
+    def write_frames(
+        self,
+        time_ns: int,
+        pictures: Sequence[FrameSample | None],
+        *,
+        late: bool = False,
+        cameras: Sequence[int] | None = None,
+    ) -> None:
+        """A frame set: one picture per camera, None where it is not there.
+
+        cameras: indices of those that the set is of (default: all). Those that camera 0 is not among are on another
+        clock, and their line is one of `extraFrames`.
+        """
+        indices = tuple(range(len(self.videos)) if cameras is None else cameras)
         pending = []
-        for video, picture in zip(self.videos, pictures, strict=True):
+        for index in indices:
+            video, picture = self.videos[index], pictures[index]
             ticket: Ticket | None = video.put(time_ns, picture) if picture is not None else None
             is_depth = picture is not None and picture.video.pixel_format == DEPTH
             pending.append(PendingPicture(ticket, picture.exposure_s if picture is not None else None, is_depth))
-        self._lines.put(PendingFrames(time_ns, tuple(pending)), late=late)
+        self._lines.put(PendingFrames(time_ns, tuple(pending), indices), late=late)
 
     def write_clock(self, state: ClockState) -> None:
         """A line of raw/clocks.jsonl, on its way to the disk at once."""

@@ -92,7 +92,7 @@ def killed_once(tmp_path_factory, pictures, until):
         folder = tmp_path_factory.mktemp("recover") / name
         writer = new_writer(folder)
         write_all(writer, pictures, late_set)
-        until(lambda writer=writer: writer._lines.frames_written == SETS)
+        until(lambda writer=writer: writer._lines._numbers[0] == SETS)
         until(lambda folder=folder: (folder / "raw" / "right.clock").exists())
         until(lambda folder=folder: (folder / "raw" / "right.clock").stat().st_size == 24 * SETS)
         until(lambda folder=folder: (folder / "raw" / "imu.pcapng").stat().st_size > 100)

@@ -368,11 +368,23 @@ def test_a_disk_too_small_is_refused_before_a_device_is_opened(bench, monkeypatc
     assert list(bench.out.iterdir()) == []
 
 
-def test_cameras_on_two_clocks_are_refused(bench):
-    bench.add("left", clock="one")
-    bench.add("right", clock="two")
-    with pytest.raises(ConfigError, match="left on one, right on two"):
-        bench.record(stop=threading.Event())
+def test_cameras_on_two_clocks_have_lines_of_their_own(bench, pictures, read_lines, calibration):
+    """The first camera's clock makes `frames`; what other clocks stamp stands beside, under a key clients pass over."""
+    content = json.loads(calibration.read_text())
+    calibration.write_text(json.dumps({"cameras": content["cameras"][:1]}))
+    bench.calibration = calibration
+    bench.add("left", camera_act(pictures(20)), clock="one")
+    bench.add("right", camera_act(pictures(15)), clock="two")
+    bench.record()
+    lines = read_lines(bench.out / "take")
+    sets = [line for line in lines if "frames" in line]
+    extras = [line for line in lines if "extraFrames" in line]
+    assert [[entry["cameraInd"] for entry in line["frames"]] for line in sets] == [[0]] * len(sets)
+    assert [[entry["cameraInd"] for entry in line["extraFrames"]] for line in extras] == [[1]] * len(extras)
+    for found in (sets, extras):
+        assert [line["number"] for line in found] == list(range(len(found)))
+    manifest = read_manifest(bench.out / "take")
+    assert [manifest.devices[name].stream.written for name in ("left", "right")] == [len(sets), len(extras)] == [20, 15]
 
 
 def test_a_calibration_with_too_few_cameras_is_refused(bench, calibration):
