@@ -446,7 +446,8 @@ class Recorded:
         self.raw = SimpleNamespace(put_clock_rows=lambda *_: None)
         self.write_clock = lambda _: None
 
-    def write_frames(self, time_ns, frames, *, late):
+    def write_frames(self, time_ns, frames, *, late, cameras):
+        assert cameras == (0, 1)
         for video, frame in zip(self.videos, frames, strict=True):
             if frame is not None:
                 video.append(int(frame.packet))
