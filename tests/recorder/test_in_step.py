@@ -4,6 +4,7 @@ The number of each picture is drawn into it, and read back from the video.
 """
 
 import json
+import os
 import time
 
 import numpy as np
@@ -22,6 +23,7 @@ from recorder.recording.writer import RecordingWriter, new_manifest
 S, MS = 1_000_000_000, 1_000_000
 START_NS = 250_000 * S
 COUNT = 36
+EXAMPLES = int(os.environ.get("RIGTAPE_EXAMPLES", "8"))
 CAMERAS = ("left", "right")  # the left one sends H.264, the right one raw pictures
 
 FAULT = st.tuples(
@@ -55,7 +57,7 @@ def samples_of(name, pictures, faults):
     return made
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(left=st.lists(FAULT, max_size=4), right=st.lists(FAULT, max_size=4))
 def test_in_step(tmp_path_factory, pictures, seen, left, right):
     folder = tmp_path_factory.mktemp("step")
