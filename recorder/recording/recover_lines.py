@@ -28,6 +28,7 @@ from recorder.recording.recover_video import VideoSurvey
 from recorder.recording.work import HashedFile
 
 NS_PER_MS = 1_000_000
+MAX_TIME_S = 1e9
 
 Line = dict[str, Any]
 
@@ -89,7 +90,8 @@ class DataSurvey:
             return None
         try:
             line = msgspec.json.decode(text, type=Line)
-            float(line["time"])
+            if not abs(line["time"]) < MAX_TIME_S:
+                return None
             cameras = tuple(sorted(entry["cameraInd"] for entry in frames_of(line)))
             if cameras not in (self.groups if "frames" in line or "extraFrames" in line else [()]):
                 return None

@@ -14,7 +14,7 @@ MIN_BLOCK_BYTES = 12
 
 def cut_to_whole(path: Path, keep_in: Path) -> int:
     """Cut what is unfinished off the end of a file in raw/; it is kept in a folder. Gives how many bytes."""
-    if not path.is_file():
+    if path.is_symlink() or not path.is_file():
         return 0
     size = path.stat().st_size
     whole = _whole_bytes(path, size)

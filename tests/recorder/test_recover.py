@@ -202,11 +202,21 @@ def test_half_a_line_at_the_end_is_no_loss(killed, exact, tail):
 
 @pytest.mark.parametrize(
     "damage",
-    [b"garbage\n", b"[]\n", b'{"time":"x"}\n', b'{"time":1,"frames":[{}]}\n', b'{"lidar":3,"time":1}\n', b"{" * 99999],
+    [
+        b"garbage",
+        b"[]",
+        b'{"time":"x"}',
+        b'{"time":1e300}',
+        b'{"time":1,"frames":[{}]}',
+        b'{"time":1,"frames":[1,2]}',
+        b'{"time":1,"extraFrames":[{"cameraInd":0}]}',
+        b'{"lidar":3,"time":1}',
+        b"{" * 99999,
+    ],
 )
 def test_a_damaged_line_is_told(killed, exact, damage):
     lines = (killed / "data.jsonl").read_bytes().splitlines(keepends=True)
-    (killed / "data.jsonl").write_bytes(b"".join([*lines[:40], damage.rstrip(b"\n") + b"\n", *lines[40:]]))
+    (killed / "data.jsonl").write_bytes(b"".join([*lines[:40], damage + b"\n", *lines[40:]]))
     assert recover(killed).lost == ["data.jsonl: 1 lines cannot be read"]
     assert exact(killed) == [ALL, RIGHT]
 
@@ -330,6 +340,14 @@ def test_raw_files_are_cut_to_what_is_whole(killed, exact):
         assert (killed / "raw" / name).read_bytes() == whole[name]
         assert (killed / BACKUP / "raw" / f"{name}.tail").read_bytes() == tail
     assert (killed / "raw" / "right.clock").stat().st_size == 24 * SETS
+
+
+def test_files_elsewhere_are_not_touched(killed, tmp_path):
+    outside = tmp_path / "outside.pcapng"
+    outside.write_bytes(b"no capture at all")
+    (killed / "raw" / "lidar.pcapng").symlink_to(outside)
+    recover(killed)
+    assert outside.read_bytes() == b"no capture at all"
 
 
 class Killed(BaseException):
