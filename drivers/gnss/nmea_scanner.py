@@ -15,6 +15,7 @@ _CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
 _RUN = re.compile(
     rb"[\r\n]*(?:\$[\x20-\x23\x25-\x29\x2b-\x7e]{0,%d}\*[0-9A-Fa-f]{2}[\r\n]*){1,64}" % (MAX_SENTENCE_BYTES - 2)
 )
+_CUT = re.compile(rb"\$[\x20-\x23\x25-\x29\x2b-\x7e]{0,%d}(?:\*[0-9A-Fa-f]?)?\Z" % (MAX_SENTENCE_BYTES - 2))
 SHORT_RUN_BYTES = 200
 
 Sentence = tuple[int, bytes]
@@ -41,7 +42,7 @@ class SentenceScanner:
         while True:
             if (run := _RUN.match(self._buffer, position)) is not None:
                 position += self._take_run(run[0], position, sentences)
-                if position == len(self._buffer):
+                if position == len(self._buffer) or _CUT.match(self._buffer, position):
                     break
             match = _START.search(self._buffer, position)
             if match is None:
