@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.epipolar import epipolar_errors
-from calibration.feature_tracks import DISTANCE_PX, POINTS, QUALITY, Image, Points, follow, full_size, halved, halvings
+from calibration.feature_tracks import DISTANCE_PX, QUALITY, Image, Points, follow, full_size, halved, halvings
 from calibration.model import Camera
 from calibration.offset_fit import JACKKNIFE_BLOCKS
 from calibration.rays import rays
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
+POINTS = 150
 MAX_LATE_S = 0.005  # beyond, a point does not move straight any more
 MAX_SIGMA_S = 0.0002
 MIN_SPEED_PX_S = 3.0

@@ -51,8 +51,10 @@ class _Style:
     frequency: tuple[tuple[float, ...], ...]
     speed_rms_m_s: float
     rate_rms_rad_s: float
+    turn_rad_s: float = 0.0  # of yaw, steady
 
 
+_REST = ((0.0, 0.0),) * 6
 _STYLES = {
     "gentle": _Style(
         amplitude=((0.85, 0.20), (0.80, 0.20), (0.25, 0.10), (2.0, 0.10), (0.22, 0.08), (0.12, 0.05)),
@@ -73,6 +75,20 @@ _STYLES = {
         speed_rms_m_s=0.20,
         rate_rms_rad_s=0.45,
     ),
+    "still": _Style(amplitude=_REST, frequency=_REST, speed_rms_m_s=0.0, rate_rms_rad_s=0.0),
+    "slide": _Style(
+        amplitude=((0.85, 0.16), (0.80, 0.16), (0.26, 0.10), *_REST[3:]),
+        frequency=((0.62, 2.00), (0.73, 1.80), (1.10, 2.60), *_REST[3:]),
+        speed_rms_m_s=0.62,
+        rate_rms_rad_s=0.0,
+    ),
+    "yaw": _Style(
+        amplitude=(*_REST[:3], (0.60, 0.30), *_REST[4:]),
+        frequency=(*_REST[:3], (1.60, 3.10), *_REST[4:]),
+        speed_rms_m_s=0.0,
+        rate_rms_rad_s=1.10,
+    ),
+    "spin": _Style(amplitude=_REST, frequency=_REST, speed_rms_m_s=0.0, rate_rms_rad_s=0.0, turn_rad_s=1.0),
 }
 
 
@@ -83,15 +99,21 @@ class Trajectory:
     motion within `RAMP_S` by a warp of time that has four continuous derivatives.
     """
 
-    def __init__(self, amplitude: FloatArray, frequency: FloatArray, phase: FloatArray) -> None:
-        """Each (6, k): rows x, y, z, yaw, pitch, roll; k sines per row, rad/s and rad."""
+    def __init__(
+        self, amplitude: FloatArray, frequency: FloatArray, phase: FloatArray, turn_rad_s: float = 0.0
+    ) -> None:
+        """Each (6, k): rows x, y, z, yaw, pitch, roll; k sines per row, rad/s and rad. turn_rad_s: a steady yaw."""
         self._amplitude = amplitude
         self._frequency = frequency
         self._phase = phase
+        self._steady = np.array([0.0, 0.0, 0.0, turn_rad_s, 0.0, 0.0])
 
     @staticmethod
     def named(name: str, seed: int) -> Trajectory:
-        """Build the trajectory `name` ("gentle", "brisk" or "board"), varied by `seed`.
+        """Build the trajectory `name`, varied by `seed`.
+
+        gentle and brisk are hand-held, board is before a calibration board; still does not move, slide does not
+        turn, yaw turns to and fro about the vertical on the spot, spin steadily round it.
 
         Raises ValueError for another name.
         """
@@ -104,14 +126,15 @@ class Trajectory:
         phase = generator.uniform(0.0, 2 * np.pi, amplitude.shape)
         for rows, rms in ((slice(0, 3), style.speed_rms_m_s), (slice(3, 6), style.rate_rms_rad_s)):
             mean_square = np.sum((amplitude[rows] * frequency[rows]) ** 2) / 2
-            frequency[rows] *= rms / np.sqrt(mean_square)
-        return Trajectory(amplitude, frequency, phase)
+            if mean_square:
+                frequency[rows] *= rms / np.sqrt(mean_square)
+        return Trajectory(amplitude, frequency, phase, style.turn_rad_s)
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return R (n, 3, 3) world_from_imu and p (n, 3) of the IMU in the world, at times (n,)."""
         warped_s, _, _ = _warp(np.asarray(t_s, dtype=np.float64))
         angle = warped_s[:, None, None] * self._frequency + self._phase
-        values = np.sum(self._amplitude * np.sin(angle), axis=2)
+        values = np.sum(self._amplitude * np.sin(angle), axis=2) + warped_s[:, None] * self._steady
         return _rotation(values[:, 3:]), values[:, :3]
 
     def kinematics(self, t_s: FloatArray) -> Kinematics:
@@ -120,8 +143,8 @@ class Trajectory:
         angle = warped_s[:, None, None] * self._frequency + self._phase
         sine, cosine = np.sin(angle), np.cos(angle)
         slope = self._amplitude * self._frequency
-        values = np.sum(self._amplitude * sine, axis=2)
-        values_1 = np.sum(slope * cosine, axis=2)
+        values = np.sum(self._amplitude * sine, axis=2) + warped_s[:, None] * self._steady
+        values_1 = np.sum(slope * cosine, axis=2) + self._steady
         values_2 = np.sum(-slope * self._frequency * sine, axis=2)[:, :3]
         rates = values_1 * first[:, None]
         return Kinematics(

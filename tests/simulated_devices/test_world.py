@@ -16,7 +16,7 @@ from simulated_devices.world import (
     magnetometer_ut,
 )
 
-NAMES = ["gentle", "brisk"]
+NAMES = ["gentle", "brisk", "still", "slide", "yaw", "spin"]
 SILENT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
