@@ -27,7 +27,7 @@ from calibration.model import Calibration, Camera
 from calibration.rays import LENSES, has_rays, rays
 from calibration.rotations import GyroIntegral
 from calibration.stereo_offset import REACH, StereoMatcher, StereoOffset
-from recorder.recording.reader import Line, find_videos
+from recorder.recording.reader import DATA_NAME, Line, find_videos, read_lines
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -111,9 +111,16 @@ Span: TypeAlias = tuple[int, int]  # frames lines, from and to (exclusive)
 
 
 def measure_motion(
-    folder: Path, data: MotionData, calibration: Calibration, budget_s: float, progress: Progress = lambda done: None
+    folder: Path,
+    data: MotionData,
+    calibration: Calibration,
+    budget_s: float,
+    *,
+    from_s: float = -np.inf,
+    to_s: float = np.inf,
+    progress: Progress = lambda done: None,
 ) -> MotionReport:
-    """Look at up to budget_s of video per camera.
+    """Look at up to budget_s of video per camera, between from_s and to_s of recording time.
 
     progress is called with the part that is done, 0..1. Raises OSError and av.error.FFmpegError for a video that
     cannot be read.
@@ -125,7 +132,8 @@ def measure_motion(
         return nothing
     period_s = float(np.median(np.diff(lines_s)))
     gyro_s, gyro_rad_s = data.gyro(*data.covered_s)
-    covered = np.flatnonzero((lines_s > data.covered_s[0]) & (lines_s < data.covered_s[1]))
+    from_s, to_s = max(from_s, data.covered_s[0]), min(to_s, data.covered_s[1])
+    covered = np.flatnonzero((lines_s > from_s) & (lines_s < to_s))
     if len(gyro_s) < 100 or len(covered) * period_s < MIN_LENGTH_S:
         return nothing
     spans = _choose(lines_s, (int(covered[0]), int(covered[-1]) + 1), gyro_s, gyro_rad_s, budget_s)
@@ -308,3 +316,12 @@ def _measure(
         step_s=look.step_s,
         pixel=1 / camera.focal_length_x_px,
     )
+
+
+def read_motion(folder: Path) -> MotionData:
+    """Gyroscope and times of pictures of a data.jsonl. Raises OSError."""
+    data = MotionData()
+    for _, _, _, line in read_lines(folder / DATA_NAME):
+        if isinstance(line, Line):
+            data.add(line)
+    return data
