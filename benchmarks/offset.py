@@ -220,7 +220,11 @@ def run(folder: Path, ideal: bool, smoke: bool) -> int:
     table.refused("constant turn", twin(folder / "spin", "spin", 15), from_s=4.0)
     yaw = look(twin(folder / "yaw", "yaw", 12)).cameras[0]
     free = isinstance(yaw, ImuCamera) and yaw.free_axis is not None and abs(yaw.offset_s) < 3 * yaw.offset_sigma_s
-    text = f"{yaw.offset_s * 1e3:+.3f} ms, free axis {np.round(yaw.free_axis or 0, 2)}" if isinstance(yaw, ImuCamera) else "none"
+    text = (
+        f"{yaw.offset_s * 1e3:+.3f} ms, free axis {np.round(yaw.free_axis or 0, 2)}"
+        if isinstance(yaw, ImuCamera)
+        else "none"
+    )
     table.add("yaw only", text, "offset, one axis free", free)
     gentle = make(folder / "gentle", "gentle", 40)
     table.offset("gentle", gentle, 0, 0.7, 0.15)

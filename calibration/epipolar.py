@@ -82,14 +82,14 @@ def direction_for(first: FloatArray, second: FloatArray, rotation: FloatArray, p
 def refine(
     first: FloatArray, second: FloatArray, rotation: FloatArray, direction: FloatArray, pixel: float
 ) -> RelativeRotation:
-    """Least Sampson error over rotation and direction, large errors held down (Cauchy, 1 px)."""
+    """Least Sampson error over rotation and direction, large errors held down (from 1 px on)."""
     ones, twos = _homogeneous(first), _homogeneous(second)
     for _ in range(STEPS):
         error, slopes, across = _sampson(ones, twos, rotation, direction)
         weights = 1 / (1 + (error / pixel) ** 2) ** 2
         normal = (slopes * weights[:, None]).T @ slopes
         normal[3:, 3:] += np.eye(2) * (pixel / DIRECTION_PRIOR) ** 2
-        step = np.linalg.solve(normal, -(slopes * weights[:, None]).T @ error)
+        step = np.asarray(np.linalg.solve(normal, -(slopes * weights[:, None]).T @ error), np.float64)
         rotation = exp(step[:3]) @ rotation
         direction = direction + across.T @ step[3:]
         direction /= np.linalg.norm(direction)
@@ -113,7 +113,9 @@ def _sampson(
     error = (twos * lines_two).sum(axis=1) * scale
     turned_two, turned_one = ones @ np.swapaxes(slopes_essential, 1, 2), twos @ slopes_essential
     slopes = (twos * turned_two).sum(axis=2)
-    lengths = (lines_two[:, :2] * turned_two[:, :, :2]).sum(axis=2) + (lines_one[:, :2] * turned_one[:, :, :2]).sum(axis=2)
+    lengths = (lines_two[:, :2] * turned_two[:, :, :2]).sum(axis=2) + (lines_one[:, :2] * turned_one[:, :, :2]).sum(
+        axis=2
+    )
     return error, (slopes * scale - error * scale**2 * lengths).T, across
 
 

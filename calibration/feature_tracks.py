@@ -34,7 +34,7 @@ _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 
 @dataclass(frozen=True, slots=True)
 class PicturePair:
-    """The same points in pictures `first` and `second` (numbers of pictures fed), each (n, 2) px of the full picture."""
+    """The same points in pictures `first` and `second` (numbers of pictures fed): (n, 2) px of the full one each."""
 
     first: int
     second: int

@@ -145,9 +145,7 @@ def measure(
     return _judged(turns, gyro, fit, steps, (size, correlation, other), step_s, span_s)
 
 
-def _turns(
-    pairs: Sequence[RayPair], found: Sequence[epipolar.RelativeRotation | None]
-) -> tuple[Turns, list[RayPair]]:
+def _turns(pairs: Sequence[RayPair], found: Sequence[epipolar.RelativeRotation | None]) -> tuple[Turns, list[RayPair]]:
     """Turns of those pairs that gave one, and these pairs."""
     good = [(pair, turn) for pair, turn in zip(pairs, found, strict=True) if turn is not None]
     if not good:
@@ -177,10 +175,9 @@ def _judged(
     spread = np.maximum(*(np.diag(part) for part in covariance(turns, gyro, drifting, DRIFTING)))
     length_s = max(float(turns.second_s[-1] - turns.first_s[0]), span_s)
     drift_sigma = float(np.sqrt(spread[1] + 12 * floor_s2 / length_s**2))
+    free: tuple[slice, ...] = CONSTANT
     if abs(drifting.drift) > 3 * drift_sigma:
         fit, free = drifting, DRIFTING
-    else:
-        free = CONSTANT
     curvature, jackknife = covariance(turns, gyro, fit, free)
     offset_sigma_s = float(np.sqrt(max(curvature[0, 0], jackknife[0, 0]) + floor_s2))
     rotation = (curvature + jackknife)[ROTATION, ROTATION] + ROTATION_FLOOR_RAD**2 * np.eye(3)

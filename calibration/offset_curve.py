@@ -132,12 +132,10 @@ def find_steps(
     return steps
 
 
-def _levels(
-    offsets_s: FloatArray, sigma_s: FloatArray, times_s: FloatArray, period_s: float
-) -> npt.NDArray[np.int64]:
+def _levels(offsets_s: FloatArray, sigma_s: FloatArray, times_s: FloatArray, period_s: float) -> npt.NDArray[np.int64]:
     """How many whole frames each window is off from the one most agree on; all 0 where a slope tells it better."""
     usual_s = offsets_s[int(np.argmin([np.abs(offsets_s - offset_s).sum() for offset_s in offsets_s]))]
-    level = np.rint((offsets_s - usual_s) / period_s).astype(np.int64)
+    level: npt.NDArray[np.int64] = np.rint((offsets_s - usual_s) / period_s).astype(np.int64)
     away_s = np.abs(offsets_s - usual_s - level * period_s)
     level[away_s > np.maximum(STEP_TOLERANCE * period_s, 3 * sigma_s)] = 0
     if not level.any():

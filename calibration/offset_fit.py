@@ -113,7 +113,8 @@ def coarse_offset(turns: Turns, gyro: GyroIntegral, search_s: float = SEARCH_S) 
 
 def _gyro_size(gyro: GyroIntegral, first_s: FloatArray, second_s: FloatArray) -> FloatArray:
     cosine = ((gyro.rotation(first_s) * gyro.rotation(second_s)).sum(axis=(1, 2)) - 1) / 2
-    return np.arccos(np.clip(cosine, -1, 1))
+    angle_rad: FloatArray = np.arccos(np.clip(cosine, -1, 1))
+    return angle_rad
 
 
 def _correlate(one: FloatArray, other: FloatArray) -> float:
@@ -146,7 +147,8 @@ def residuals(turns: Turns, gyro: GyroIntegral, fit: Fit) -> FloatArray:
     """Size of each pair's residual, (n,), in units of what its information says."""
     prediction, _ = _predict(turns, gyro, fit)
     error = log(turns.rotation @ np.swapaxes(prediction, 1, 2))
-    return np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", error, turns.information, error)))
+    size: FloatArray = np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", error, turns.information, error)))
+    return size
 
 
 def _predict(turns: Turns, gyro: GyroIntegral, fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -215,6 +217,8 @@ def covariance(turns: Turns, gyro: GyroIntegral, fit: Fit, free: tuple[slice, ..
     for left_out in range(JACKKNIFE_BLOCKS):
         again = solve(turns.only(block != left_out), gyro, fit, free, iterations=3)
         turned = log(again.camera_from_imu @ fit.camera_from_imu.T)
-        changes.append([again.offset_s - fit.offset_s, again.drift - fit.drift, *turned, *again.bias_rad_s - fit.bias_rad_s])
+        changes.append(
+            [again.offset_s - fit.offset_s, again.drift - fit.drift, *turned, *again.bias_rad_s - fit.bias_rad_s]
+        )
     spread = np.array(changes) - np.mean(changes, axis=0)
     return curvature, (JACKKNIFE_BLOCKS - 1) / JACKKNIFE_BLOCKS * spread.T @ spread

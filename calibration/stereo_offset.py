@@ -109,7 +109,7 @@ def _regress(errors: FloatArray, slopes: FloatArray) -> float:
     found = np.zeros(slopes.shape[1])
     for _ in range(8):
         weighted = slopes * weights[:, None]
-        found = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ errors, rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(weighted.T @ slopes, weighted.T @ errors, rcond=None)[0], np.float64)
         left = errors - slopes @ found
         weights = 1 / (1 + (left / (3 * 1.4826 * np.median(np.abs(left)) + 1e-6)) ** 2)
     return float(found[0])

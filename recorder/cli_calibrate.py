@@ -21,6 +21,7 @@ from recorder.board_calibration import calibrate_cameras
 from recorder.calibration_import import FORMATS, Choices, import_calibration
 from recorder.calibration_report import print_calibration, to_html
 from recorder.cli_common import RigFile, clear_errors, stop_on_signals
+from recorder.cli_imu_camera import imu_camera
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.rig import load_rig
 from recorder.session import record
@@ -343,3 +344,6 @@ def import_(
         size_text = f"{camera.image_width_px}x{camera.image_height_px}"
         click.echo(f"camera {index}: {camera.model} {size_text}, focal length {camera.focal_length_x_px:.2f} px")
     click.echo(f"written: {output}")
+
+
+calibrate.add_command(imu_camera)

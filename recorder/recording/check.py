@@ -1,7 +1,8 @@
 """Is a recording whole, and will the clients make of it what it is?
 
 `check` looks at each part in turn: manifest, calibration, data.jsonl (one pass, with the scans it names), streams,
-videos, devices, files. Each look adds findings. Recordings of other programs, without manifest, are checked too.
+videos, motion, devices, files. Each look adds findings. Recordings of other programs, without manifest, are checked
+too.
 """
 
 import hashlib
@@ -15,12 +16,15 @@ from rich.table import Column, Table
 
 from calibration.model import Calibration, CalibrationError, load_calibration, validate
 from recorder.recording.check_data import DataCheck, Finding, Findings, Progress, file_size, path_inside
+from recorder.recording.check_motion import check_motion
 from recorder.recording.manifest import EVENTS_NAME, MANIFEST_NAME, Manifest, main_cameras, read_manifest
+from recorder.recording.motion import MotionReport
 from recorder.recording.reader import DATA_NAME, MAX_LINE_BYTES, StreamStats, VideoStats, find_videos, read_video
 
 CALIBRATION_NAME = "calibration.json"
 BACKUP = "before_recovery"
 RATE_TOLERANCE = 0.05
+DATA_SHARE = 0.3  # of the progress; the rest is for the motion
 EDGE_S = 3.0  # how much later than the others a stream may begin, or earlier than the take end
 ACCEL_MEAN_MIN_M_S2, ACCEL_MEAN_MAX_M_S2 = 8.0, 12.0
 GYRO_MAX_RAD_S = 20.0
@@ -40,12 +44,13 @@ class StreamReport(msgspec.Struct):
 
 
 class Report(msgspec.Struct):
-    """What check found. state: the manifest's, null without one."""
+    """What check found. state: the manifest's, null without one; motion: null where it was not looked at."""
 
     folder: str
     state: str | None
     streams: list[StreamReport]
     videos: list[VideoStats]
+    motion: MotionReport | None
     findings: list[Finding]
 
     @property
@@ -59,20 +64,26 @@ class Report(msgspec.Struct):
         return msgspec.json.encode(msgspec.structs.asdict(self) | {"exit_code": self.exit_code}).decode()
 
 
-def check(folder: Path, deep: bool = False, progress: Progress = lambda done: None) -> Report:
+def check(folder: Path, deep: bool = False, motion: bool = True, progress: Progress = lambda done: None) -> Report:
     """Look at a recording from all sides.
 
-    deep: decode all pictures, hash all files, look into all scans. progress: called with the part of data.jsonl that
-    is read, 0..1.
+    deep: decode all pictures, hash all files, look into all scans. motion: compare how the pictures turn with the
+    gyroscope. progress: called with the part that is done, 0..1.
     """
     findings = Findings()
     manifest = _check_manifest(folder, findings)
     calibration = None if manifest and not manifest.cameras else _check_calibration(folder, manifest, findings)
     camera_count = len(manifest.cameras) if manifest else len(calibration.cameras) if calibration else None
     data = DataCheck(folder, camera_count, manifest, findings, deep)
-    data.run(progress)
+    data.run(lambda done: progress(done * (DATA_SHARE if motion else 1.0)))
     _check_streams(data, manifest, findings)
     videos = _check_videos(folder, data, calibration, deep, findings)
+    found = None
+    if motion and calibration and not validate(calibration) and _one_gyro(manifest):
+        found = check_motion(
+            folder, data.motion, calibration, findings, lambda done: progress(DATA_SHARE + done * (1 - DATA_SHARE))
+        )
+    progress(1.0)
     _check_left_over(folder, data.scan_files, findings)
     if manifest:
         _check_events(folder, findings)
@@ -85,7 +96,13 @@ def check(folder: Path, deep: bool = False, progress: Progress = lambda done: No
         StreamReport(name, stats.count, stats.rate_hz, stats.expected_hz, stats.first_s, stats.last_s, stats.gap_count)
         for name, stats in sorted(data.streams.by_name.items())
     ]
-    return Report(str(folder), manifest.state if manifest else None, streams, videos, findings.sorted())
+    return Report(str(folder), manifest.state if manifest else None, streams, videos, found, findings.sorted())
+
+
+def _one_gyro(manifest: Manifest | None) -> bool:
+    """Whether the gyroscope's lines are of one device."""
+    devices = manifest.devices.values() if manifest else ()
+    return sum("gyroscope" in device.stream.sensor_lines for device in devices) <= 1
 
 
 def _check_manifest(folder: Path, findings: Findings) -> Manifest | None:

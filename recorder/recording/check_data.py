@@ -13,6 +13,7 @@ from msgspec import UNSET
 
 from drivers.samples import POINT_DTYPE
 from recorder.recording.manifest import Manifest, main_cameras
+from recorder.recording.motion import MotionData
 from recorder.recording.reader import DATA_NAME, BadLine, FrameEntry, Gps, LidarEntry, Line, Streams, read_lines
 
 Severity = Literal["error", "warning", "note"]
@@ -71,7 +72,7 @@ class DataCheck:
     """One pass over data.jsonl.
 
     streams: statistics by stream; pictures: by camera, entries that must have one in the video; scan_files: as named
-    by lidar lines; pose_streams: names of streams that are poses.
+    by lidar lines; pose_streams: names of streams that are poses; motion: what is needed to look at the motion.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class DataCheck:
         self.pictures: Counter[int] = Counter()
         self.scan_files: set[str] = set()
         self.pose_streams: set[str] = set()
+        self.motion = MotionData()
         self.camera_count = camera_count
         self._main_cameras = main_cameras(manifest) if manifest else None
         self._folder = folder
@@ -120,6 +122,7 @@ class DataCheck:
     def _check_line(self, number: int, stream: str, line: Line, time_s: float) -> None:
         stats = self.streams[stream]
         stats.add(time_s, number)
+        self.motion.add(line)
         if line.sensor is not UNSET:
             values = line.sensor.values
             if len(values) != VALUES_OF_SENSOR.get(stream, len(values)):

@@ -142,9 +142,7 @@ def measure_motion(
     span_s = max(period_s, motion.span_for(gyro, times_s))
     look = _Look(folder, data, calibration, spans, period_s, span_s)
     look.run(progress)
-    found = [
-        _measure(calibration.cameras[camera], look.pairs[camera], lines_s, gyro, look) for camera in cameras
-    ]
+    found = [_measure(calibration.cameras[camera], look.pairs[camera], lines_s, gyro, look) for camera in cameras]
     progress(1.0)
     stereo = look.matcher.solve() if look.matcher else None
     return MotionReport(found, stereo, len(times_s) * period_s, period_s)
@@ -277,12 +275,14 @@ def _pictures(folder: Path, camera: int, data: MotionData, spans: list[Span]) ->
             stream = container.streams.video[0]
             number = start
             packets = (packet for packet in container.demux(stream))
-            pictures = itertools.chain.from_iterable(packet.decode() for packet in itertools.islice(packets, start, None))
+            pictures = itertools.chain.from_iterable(
+                packet.decode() for packet in itertools.islice(packets, start, None)
+            )
             for picture in pictures:
                 if number >= end:
                     break
                 if number >= begin and number < len(lines):
-                    yield int(lines[number]), picture.to_ndarray(format="gray")
+                    yield int(lines[number]), np.asarray(picture.to_ndarray(format="gray"), np.uint8)
                 number += 1
 
 
