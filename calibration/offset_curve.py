@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration import motion
-from calibration.offset_fit import OFFSET, Fit, Turns, residuals, solve
+from calibration.offset_fit import BIAS, OFFSET, ROTATION, Fit, Turns, residuals, solve
 from calibration.rotations import GyroIntegral
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
@@ -26,6 +26,7 @@ WINDOW_SIGMA_RAD, WINDOW_SIGMA_S = 0.6e-3, 0.05e-3
 SCAN_PERIODS, SCAN_STEP_S = 4.5, 0.005
 OUTLIER = 3.0
 MIN_GAIN = 10.0  # log likelihood by which one frame away must fit better
+TRIALS = 3
 STEP_TOLERANCE = 0.25  # of a period
 
 
@@ -97,7 +98,26 @@ def follow_offset(
 def find_steps(
     turns: Turns, gyro: GyroIntegral, fit: Fit, period_s: float, step_s: float, span_s: float
 ) -> list[OffsetStep]:
-    """Where the offset jumps by whole frames."""
+    """Where the offset jumps by whole frames.
+
+    A fit over both sides of a step has a rotation that is good for neither, which blurs what the windows say. So what
+    looks like a step is taken out, the rotation is found again, and only then is it judged.
+    """
+    steps = _candidates(turns, gyro, fit, period_s, step_s, span_s, strict=False)
+    for _ in range(TRIALS):
+        if not steps:
+            return []
+        fit = solve(without_steps(turns, steps), gyro, fit, (OFFSET, ROTATION, BIAS))
+        before, steps = steps, _candidates(turns, gyro, fit, period_s, step_s, span_s, strict=False)
+        if steps == before:
+            break
+    return _candidates(turns, gyro, fit, period_s, step_s, span_s, strict=True)
+
+
+def _candidates(
+    turns: Turns, gyro: GyroIntegral, fit: Fit, period_s: float, step_s: float, span_s: float, *, strict: bool
+) -> list[OffsetStep]:
+    """Steps; strict: only those that are whole frames as far as the windows can tell, and no slope."""
     windows = _windows(turns, gyro, step_s, span_s)
     if len(windows) < 2:
         return []
@@ -112,7 +132,7 @@ def find_steps(
         offsets_s.append(solve(window.turns, gyro, replace(fit, offset_s=best), (OFFSET,)).offset_s)
     found = np.array(offsets_s)
     sigma_s = np.array([window.sigma_s for window in windows])
-    level = _levels(found, sigma_s, np.array([window.middle_s for window in windows]), period_s)
+    level = _levels(found, sigma_s, np.array([window.middle_s for window in windows]), period_s, strict)
     steps = []
     for index in np.flatnonzero(np.diff(level)):
         frames = int(level[index + 1] - level[index])
@@ -132,11 +152,18 @@ def find_steps(
     return steps
 
 
-def _levels(offsets_s: FloatArray, sigma_s: FloatArray, times_s: FloatArray, period_s: float) -> npt.NDArray[np.int64]:
-    """How many whole frames each window is off from the one most agree on; all 0 where a slope tells it better."""
+def _levels(
+    offsets_s: FloatArray, sigma_s: FloatArray, times_s: FloatArray, period_s: float, strict: bool
+) -> npt.NDArray[np.int64]:
+    """How many whole frames each window is off from the one most agree on.
+
+    strict: 0 for those that are not whole frames off, and for all where a slope tells it better.
+    """
     usual_s = offsets_s[int(np.argmin([np.abs(offsets_s - offset_s).sum() for offset_s in offsets_s]))]
     level: npt.NDArray[np.int64] = np.rint((offsets_s - usual_s) / period_s).astype(np.int64)
     away_s = np.abs(offsets_s - usual_s - level * period_s)
+    if not strict:
+        return level
     level[away_s > np.maximum(STEP_TOLERANCE * period_s, 3 * sigma_s)] = 0
     if not level.any():
         return level
