@@ -127,7 +127,7 @@ def _candidates(
     grid_s = fit.offset_s + np.arange(-reach, reach + 1) * SCAN_STEP_S
     offsets_s = []
     for window in windows:
-        costs = np.array([_costs(window.turns, gyro, replace(fit, offset_s=s), scale).sum() for s in grid_s]) / overlap
+        costs = _scan(window.turns, gyro, fit, grid_s, scale) / overlap
         best = float(grid_s[int(np.argmin(costs))])
         offsets_s.append(solve(window.turns, gyro, replace(fit, offset_s=best), (OFFSET,)).offset_s)
     found = np.array(offsets_s)
@@ -155,11 +155,12 @@ def _candidates(
 def _levels(
     offsets_s: FloatArray, sigma_s: FloatArray, times_s: FloatArray, period_s: float, strict: bool
 ) -> npt.NDArray[np.int64]:
-    """How many whole frames each window is off from the one most agree on.
+    """How many whole frames each window is off from the one that most agree with, but for whole frames.
 
     strict: 0 for those that are not whole frames off, and for all where a slope tells it better.
     """
-    usual_s = offsets_s[int(np.argmin([np.abs(offsets_s - offset_s).sum() for offset_s in offsets_s]))]
+    apart = (offsets_s - offsets_s[:, None]) / period_s
+    usual_s = offsets_s[int(np.argmin((np.abs(apart - np.rint(apart)) / sigma_s).sum(axis=1)))]
     level: npt.NDArray[np.int64] = np.rint((offsets_s - usual_s) / period_s).astype(np.int64)
     away_s = np.abs(offsets_s - usual_s - level * period_s)
     if not strict:
@@ -170,9 +171,22 @@ def _levels(
     by_steps = (offsets_s - usual_s - level * period_s) / sigma_s
     slope = np.polyfit(times_s, offsets_s, 1, w=1 / sigma_s)
     by_slope = (offsets_s - np.polyval(slope, times_s)) / sigma_s
-    if np.sqrt((by_steps**2).mean()) > 0.5 * np.sqrt((by_slope**2).mean()):
+    if np.median(np.abs(by_steps)) > 0.5 * np.median(np.abs(by_slope)):  # a window over a step fits neither
         return np.zeros_like(level)
     return level
+
+
+def _scan(turns: Turns, gyro: GyroIntegral, fit: Fit, offsets_s: FloatArray, scale: float) -> FloatArray:
+    """Costs of all pairs together at each offset, (n,)."""
+    copies = len(offsets_s)
+    early_s = np.repeat(offsets_s - fit.offset_s, len(turns))  # stamps that much earlier, instead of another offset
+    many = Turns(
+        np.tile(turns.first_s, copies) - early_s,
+        np.tile(turns.second_s, copies) - early_s,
+        np.tile(turns.rotation, (copies, 1, 1)),
+        np.tile(turns.information, (copies, 1, 1)),
+    )
+    return np.asarray(_costs(many, gyro, fit, scale).reshape(copies, -1).sum(axis=1), np.float64)
 
 
 def _costs(turns: Turns, gyro: GyroIntegral, fit: Fit, scale: float) -> FloatArray:

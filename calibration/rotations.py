@@ -10,6 +10,7 @@ import numpy.typing as npt
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 _SMALL_RAD = 1e-4
+_HALF_TURN_COSINE = -0.99
 
 
 def cross_matrix(vectors: FloatArray) -> FloatArray:
@@ -32,7 +33,7 @@ def exp(vectors: FloatArray) -> FloatArray:
 
 
 def log(matrices: FloatArray) -> FloatArray:
-    """Matrices -> rotation vectors (n, 3) rad, for angles well below pi."""
+    """Matrices (n, 3, 3) or one (3, 3) -> rotation vectors rad; at half a turn, of either sign."""
     axis = np.stack(
         [
             matrices[..., 2, 1] - matrices[..., 1, 2],
@@ -46,6 +47,20 @@ def log(matrices: FloatArray) -> FloatArray:
     angle = np.arctan2(sine, cosine)
     factor = np.where(sine < _SMALL_RAD, 0.5, angle / np.where(sine < _SMALL_RAD, 1.0, 2 * sine))
     result: FloatArray = axis * factor[..., None]
+    half = cosine < _HALF_TURN_COSINE  # the difference above fades out there: the axis is in the sum
+    if np.any(half):
+        result[half] = _log_half_turn(matrices[half], axis[half], angle[half])
+    return result
+
+
+def _log_half_turn(matrices: FloatArray, axis: FloatArray, angle: FloatArray) -> FloatArray:
+    cosine = np.cos(angle)[..., None, None]
+    outer = ((matrices + np.swapaxes(matrices, -1, -2)) / 2 - cosine * np.eye(3)) / (1 - cosine)
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    column = np.take_along_axis(outer, largest[..., None, None], axis=-1)[..., 0]
+    column = column / np.linalg.norm(column, axis=-1)[..., None]
+    sign = np.where((column * axis).sum(axis=-1) < 0, -1.0, 1.0)
+    result: FloatArray = column * (sign * angle)[..., None]
     return result
 
 

@@ -88,7 +88,8 @@ def _print(
         console.print(f"camera 1 takes its pictures {text} after camera 0", markup=False)
     for text in proposal.kept:
         console.print(f"left as it is: {text}", markup=False)
-    for text in changes or ["calibration.json agrees"]:
+    measured = any(isinstance(found, ImuCamera) for found in report.cameras)
+    for text in changes or ["nothing to change in calibration.json"] * measured:
         console.print(text, markup=False)
 
 

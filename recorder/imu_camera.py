@@ -67,8 +67,8 @@ def propose(calibration: Calibration, report: MotionReport) -> Proposal:
     for index, found in enumerate(report.cameras):
         offsets.append(None)
         if isinstance(found, NotShown):
-            kept.append(f"camera {index}: {found.reason}")
-        elif found.steps or found.drifts:
+            continue
+        if found.steps or found.drifts:
             kept.append(f"camera {index}: its offset is not constant, which no {SHIFT_KEY} can say")
         elif found.ambiguous:
             kept.append(f"camera {index}: the motion repeats itself, so that another offset fits nearly as well")
@@ -99,12 +99,12 @@ def _turn(calibration: Calibration, report: MotionReport, kept: list[str]) -> tu
             kept.append(f"camera {index}: the motion tells nothing of its rotation about one axis")
             continue
         known = calibration.cameras[index].matrix[:3, :3]
-        turns.append(np.degrees(log(known.T @ np.array(found.camera_from_imu))))
+        turns.append(known.T @ np.array(found.camera_from_imu))
         weights.append(float(np.max(found.rotation_sigma_deg)) ** -2)
     if not turns:
         return None, None
-    turn = np.average(turns, axis=0, weights=weights)
-    return turn.tolist(), max(weights) ** -0.5
+    beside = np.average([log(turns[0].T @ turn) for turn in turns], axis=0, weights=weights)
+    return np.degrees(log(turns[0] @ exp(beside))).tolist(), max(weights) ** -0.5
 
 
 def updated(calibration: Calibration, proposal: Proposal) -> tuple[Calibration, list[str]]:
