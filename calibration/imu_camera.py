@@ -69,8 +69,8 @@ class NotShown(msgspec.Struct, tag="not shown", tag_field="result"):
 class ImuCamera(msgspec.Struct, tag="measured", tag_field="result"):
     """What was found; each sigma is meant to be true, not only what the fit believes.
 
-    offset_s: at the middle of what was looked at, before the first step; drift_ppm: how it changes. camera_from_imu: 3x3
-    row major. rotation_sigma_deg: about the camera's x, y, z; free_axis: the camera's axis about which the motion
+    offset_s: at the middle of what was looked at, before the first step; drift_ppm: how it changes. camera_from_imu:
+    3x3 row major. rotation_sigma_deg: about the camera's x, y, z; free_axis: the camera's axis about which the motion
     tells nothing, null where all three are told. coarse: the offset is good for a millisecond or two only.
     """
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import av
+import cv2
 import msgspec
 import numpy as np
 
@@ -54,7 +55,9 @@ def look(
     except CalibrationError as error:
         raise RecorderError(str(error)) from error
     except (OSError, av.error.FFmpegError) as error:
-        raise StorageError(f"{folder}: cannot be read: {error}") from error
+        raise StorageError(f"{error.filename or folder}: cannot be read: {error.strerror}") from error
+    except (np.linalg.LinAlgError, cv2.error) as error:
+        raise RecorderError(f"{folder}: its pictures and gyroscope come to nothing: {error}") from error
     if not report.cameras:
         raise RecorderError(f"{folder}: there are no two seconds of pictures and gyroscope together in it")
     return calibration, report, propose(calibration, report)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import av
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -40,7 +41,7 @@ def check_motion(
     """Look at up to BUDGET_S of each video; None where it cannot be decoded (which others tell of)."""
     try:
         report = measure_motion(folder, data, calibration, BUDGET_S, progress=progress)
-    except (av.error.FFmpegError, OSError, ValueError, np.linalg.LinAlgError):
+    except (av.error.FFmpegError, OSError, ValueError, np.linalg.LinAlgError, cv2.error):
         return None
     for index, found in enumerate(report.cameras):
         if isinstance(found, ImuCamera):

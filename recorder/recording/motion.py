@@ -269,6 +269,7 @@ def _pictures(folder: Path, camera: int, data: MotionData, spans: list[Span]) ->
         return
     path = str(videos[-1])
     keys = _key_frames(path) if len(spans) > 1 else [0]
+    shape: tuple[int, ...] | None = None
     for begin, end in wanted:
         start = max((key for key in keys if key <= begin), default=0)
         with av.open(path) as container:
@@ -282,7 +283,10 @@ def _pictures(folder: Path, camera: int, data: MotionData, spans: list[Span]) ->
                 if number >= end:
                     break
                 if number >= begin and number < len(lines):
-                    yield int(lines[number]), np.asarray(picture.to_ndarray(format="gray"), np.uint8)
+                    gray = np.asarray(picture.to_ndarray(format="gray"), np.uint8)
+                    shape = shape or gray.shape
+                    if gray.shape == shape:  # of a video that changes its size, the first one counts
+                        yield int(lines[number]), gray
                 number += 1
 
 
