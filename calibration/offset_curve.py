@@ -124,7 +124,7 @@ def _candidates(
     scale = OUTLIER * max(1.0, float(np.median(residuals(turns, gyro, fit))))
     overlap = max(1.0, span_s / step_s)
     reach = round(SCAN_PERIODS * period_s / SCAN_STEP_S)
-    grid_s: FloatArray = fit.offset_s + np.arange(-reach, reach + 1) * SCAN_STEP_S
+    grid_s = np.asarray(fit.offset_s + np.arange(-reach, reach + 1) * SCAN_STEP_S, np.float64)
     offsets_s = []
     for window in windows:
         costs = _scan(window.turns, gyro, fit, grid_s, scale) / overlap
