@@ -61,9 +61,8 @@ class MotionData:
     _gyro: array[float] = field(default_factory=lambda: array("d"))
     _lines_s: array[float] = field(default_factory=lambda: array("d"))
     _shown: dict[int, array[int]] = field(default_factory=dict)
+    _apart: set[int] = field(default_factory=set)
     _last_s: float = -np.inf
-    _cameras: int = 0
-    complete: bool = True
 
     def add(self, line: Line) -> None:
         """Keep what is needed of a line."""
@@ -72,12 +71,13 @@ class MotionData:
         if line.sensor is not UNSET and line.sensor.type == "gyroscope":
             values = line.sensor.values
             good = len(values) == 3 and line.time > self._last_s and max(map(abs, values)) < MAX_RATE_RAD_S
-            if len(self._gyro) >= 4 * MAX_SAMPLES:
-                self.complete = False
-            elif good:
+            if good and len(self._gyro) < 4 * MAX_SAMPLES:
                 self._last_s = line.time
                 self._gyro.extend((line.time, *values))
         elif line.frames is not UNSET:
+            if all(entry.camera_ind != 0 for entry in line.frames):  # a camera with lines of its own
+                self._apart.update(entry.camera_ind for entry in line.frames)
+                return
             number = len(self._lines_s)
             self._lines_s.append(line.time)
             for entry in line.frames:
@@ -90,8 +90,9 @@ class MotionData:
         return np.frombuffer(self._lines_s, np.float64)
 
     def pictures(self, camera: int) -> npt.NDArray[np.int64]:
-        """For each picture of a camera's video, the number of its line."""
-        return np.frombuffer(self._shown.get(camera, array("q")), np.int64)
+        """For each picture of a camera's video, the number of its line; none of a camera with lines of its own."""
+        shown = array("q") if camera in self._apart else self._shown.get(camera, array("q"))
+        return np.frombuffer(shown, np.int64)
 
     def gyro(self, from_s: float, to_s: float) -> tuple[FloatArray, FloatArray]:
         """Times (n,) and rates (n, 3) of the gyroscope in a span."""
