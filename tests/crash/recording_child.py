@@ -52,8 +52,8 @@ def main() -> None:
     video.IDLE_S = 0.05
     tell_what_is_muxed()
     devices = {
-        name: DeviceSummary("made-up", name, 0.0, {}, StreamSummary("imu" if name == "imu" else "frames"))
-        for name in ("imu", *CAMERAS)
+        name: DeviceSummary("made-up", clock, 0.0, {}, StreamSummary(kind))
+        for name, clock, kind in (("imu", "imu", "imu"), *((camera, "cameras", "frames") for camera in CAMERAS))
     }
     manifest = new_manifest(
         "killed", start_monotonic_ns=0, utc_ns=1_700_000_000_000_000_000, utc_source="host clock",
