@@ -116,7 +116,7 @@ class DataReading:
             return f"time {time_s} is not a time in seconds"
         if line.sensor is not UNSET:
             return self._take_reading(stream, time_s, line.sensor.values)
-        if line.frames is not UNSET:
+        if line.frames is not UNSET or line.extra_frames is not UNSET:
             return self._take_frames(time_s, line)
         if line.gps is not UNSET:
             self._take_fix(time_s, line.gps, line.fix)
@@ -140,7 +140,7 @@ class DataReading:
 
     def _take_frames(self, time_s: float, line: Line) -> str:
         entries: list[tuple[int, int, float]] = []
-        for entry in line.frames or ():
+        for entry in line.frames or line.extra_frames or ():
             camera = entry.camera_ind
             if not 0 <= camera < MAX_CAMERAS:
                 return f"cameraInd {camera} is not in 0..{MAX_CAMERAS - 1}"

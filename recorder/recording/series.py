@@ -86,7 +86,7 @@ class ImuReadings(Series):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames(Series):
-    """Frame sets: one picture of each camera, or none.
+    """Frame sets: one picture of each camera, or none. Cameras on different clocks have sets of their own.
 
     picture: (n, cameras) int64, which picture of the video it is, -1 where it is missing.
     exposure_s: (n, cameras), NaN where not known. cameras: their names; videos: their files.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import recorder
 from drivers.device import DeviceConfig
 from drivers.samples import LostFrame
 from recorder.pipeline import DeviceInTake, Pipeline
@@ -115,6 +116,18 @@ def test_recorded(recordings, seen):
     assert {name: (stream.kind, stream.count) for name, stream in streams.items()} == {
         "frames": ("frames", COUNT), "extraFrames2": ("frames", COUNT - 5)
     }  # fmt: skip
+
+
+def test_opened(recordings):
+    frames = recorder.open(recordings[0]).frames
+    assert frames.cameras == tuple(CLOCKS)
+    assert len(frames) == COUNT + COUNT - 5
+    shown = frames.picture >= 0
+    assert shown.sum(axis=0).tolist() == [COUNT, COUNT - 3, COUNT - 5]
+    assert not (shown[:, 2] & (shown[:, 0] | shown[:, 1])).any()
+    last = int(shown[:, 2].nonzero()[0][-1])
+    level = 20 + 6 * (COUNT - 1)
+    assert frames.image(last, 2).mean() == pytest.approx((level - 16) * 255 / 219, abs=3)  # shown in the full range
 
 
 def test_refined(recordings, seen, tmp_path):
