@@ -368,9 +368,7 @@ class ClockMap:
             return self._estimator.host_many(device_ns)
         return self._estimator.host_ns(device_ns)
 
-    def observe_two_way(
-        self, ticks: int, sent_ns: int, received_ns: int, stream: ClockStream | None = None
-    ) -> None:
+    def observe_two_way(self, ticks: int, sent_ns: int, received_ns: int, stream: ClockStream | None = None) -> None:
         """A query sent and its answer received with the device's ticks in between: bounds from both sides.
 
         They tell the least delay of the link (`floor_ns`), and stamps move earlier by it, at the usual rate. The pairs

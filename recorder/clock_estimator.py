@@ -28,6 +28,7 @@ BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
 IGNORE_TRUST, MIN_TRUST = 0.3, 0.5
 GRID_LEVEL = 0.008
+HEIGHT_SIGMA = 0.7  # of the usual height of the lowest arrivals above the floor
 LAW_ERROR = 0.025  # of the mean delay times the law's shape: one sigma of the place of the floor under a fitted law
 CLEARANCE_ERROR = 0.6  # of the height above the place by the delay law
 GRID_LEVEL_S = 120  # the grid's curve is put on the lowest point of this last time
@@ -326,6 +327,9 @@ class Estimator:
             self.grid_line = self.grid.fit(line, prior) if self.grid is not None else None
             if self.grid_line is not None:
                 line = combine(line, self.grid_line, buckets, self.level, self.last_x)
+            if self.grid is not None:
+                samples = sum(bucket.samples for bucket in buckets)
+                line = line.less_sure(HEIGHT_SIGMA * self.grid.height_ns(samples, line.spread_ns))
             self._ready = (epoch, line)
 
     def settle(self) -> None:

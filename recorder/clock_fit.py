@@ -34,7 +34,6 @@ SHRINK = 0.6
 LEAST_DOUBT = 1e-6  # arrivals without any jitter leave none, and a weight must stay finite
 BLOCKS = 12
 UNSTEADY = 7.0
-UNSTEADY_FADES = 1.0
 UNSTEADY_LEVEL = 0.2
 TOUCHING = 1.4
 LEVEL = 0.45  # error of the level by that of slope times span
@@ -274,7 +273,7 @@ def touching_error(height: Floats, pieces: int = 1) -> tuple[float, float]:
 
 def _unsteadiness(usual: float, spread: float, minutes: float) -> float:
     """How far the floor itself may move slowly, in spreads: hardly, where the lowest points lie close to the line."""
-    return min(UNSTEADY * usual / spread, 1.0) ** 4 * 4.0 / (1 + minutes) ** UNSTEADY_FADES
+    return 4.0 * math.pow(min(UNSTEADY * usual / spread, 1.0), 4) / (1 + minutes)
 
 
 def _slope_room(x: Floats, above: Floats, lowest: int) -> float:

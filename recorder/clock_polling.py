@@ -131,6 +131,14 @@ class PollingGrid:
 
         return hidden
 
+    def height_ns(self, samples: float, spread_ns: float) -> float:
+        """How far above the floor the lowest of so many polled arrivals usually is; 0 without polls.
+
+        Of delays that begin like a gamma law of shape 2 and scale s, samples * d^3 / (6 s^2 period) are less than d
+        late when they are seen.
+        """
+        return math.cbrt(1.5 * spread_ns**2 * self.period_ns / max(samples, 1.0))
+
     def unseen_ns(self, age_s: float) -> float:
         """One sigma of the height above the floor that the polls may hide from a line under the arrivals.
 

@@ -138,7 +138,9 @@ class Timebase:
         if isinstance(sample, ClockPairs):
             entry.stream.observe_many(sample.ticks, sample.arrival_ns - entry.latency_ns)
             if sample.sent_ns is not None:
-                for pair in zip(sample.ticks.tolist(), sample.sent_ns.tolist(), sample.arrival_ns.tolist(), strict=True):
+                for pair in zip(
+                    sample.ticks.tolist(), sample.sent_ns.tolist(), sample.arrival_ns.tolist(), strict=True
+                ):
                     clock.map.observe_two_way(*pair, stream=entry.stream)
         elif isinstance(sample, ScanSample):
             clock.waiting.append((entry, entry.stream.unwrap(sample.last_ticks), arrival_ns, sample))
