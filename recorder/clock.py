@@ -93,7 +93,7 @@ class ClockStream:
 
     def expect_restart(self) -> None:
         """The device was connected anew: unless the next samples lie on the line, its clock has restarted."""
-        self._reconnected = True
+        self._reconnected = self._epoch >= 0
 
     @property
     def tick_ns(self) -> float:

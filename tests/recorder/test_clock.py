@@ -309,6 +309,23 @@ def test_reconnected_clock_that_ran_on_keeps_its_epoch() -> None:
     assert clock.epoch == 0
 
 
+def test_first_connection_is_no_restart() -> None:
+    """Two streams of one clock, the second one held up for half a second at its start."""
+    t = trace(duration_s=20.0, rate_hz=100.0)
+    clock = ClockMap(1e6)
+    streams = clock.stream(1e6), clock.stream(1e6)
+    for stream in streams:
+        stream.expect_restart()
+    errors_ns = []
+    for i, (true, tick, arrival) in enumerate(
+        zip(t.true_ns.tolist(), t.ticks.tolist(), t.arrival_ns.tolist(), strict=True)
+    ):
+        late_ns = 500 * MS if i % 2 and true < BOOT_NS + 10**9 else 0
+        errors_ns.append(streams[i % 2].map(tick, arrival + late_ns) - true)
+    assert clock.epoch == 0
+    assert np.abs(errors_ns[-100:]).max() < 1 * MS
+
+
 def test_announced_suspend_is_exact_at_once() -> None:
     t = jumped(trace(duration_s=40.0), 20.0, 30.0)
     clock = ClockMap(1e6)
