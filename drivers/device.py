@@ -6,7 +6,7 @@ entry point group `rigtape.drivers`, so any installed package can add one.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from threading import Event
 from typing import Any, Protocol
@@ -43,11 +43,13 @@ class StreamSpec:
     """One kind of sample a device sends: its kind in the recording, and the rate and size to expect.
 
     kind: imu, gnss, pose, frames or lidar. rate_hz None: not known beforehand. bytes_per_s: on disk, raw tape included.
+    name: of a device with several streams, which one this is; the recording calls it DEVICE.NAME.
     """
 
     kind: str
     rate_hz: float | None
     bytes_per_s: float
+    name: str = ""
 
 
 class Driver(Protocol):
@@ -63,7 +65,7 @@ class Driver(Protocol):
 
     @property
     def streams(self) -> tuple[StreamSpec, ...]:
-        """What it sends, with the rates to expect."""
+        """What it sends, with the rates to expect; all of it is stamped by its one clock."""
 
     @property
     def identity(self) -> dict[str, str]:
@@ -144,7 +146,7 @@ def _announced(driver: Driver, stop: Event) -> Iterator[Received]:
         if not is_announced and (item.chunks or item.samples):
             is_announced = True
             event = DeviceEvent("connected", _identity_text(driver))
-            yield Received(item.chunks, item.samples, (event, *item.events))
+            yield replace(item, events=(event, *item.events))
         else:
             yield item
     if not stop.is_set():

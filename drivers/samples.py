@@ -212,8 +212,12 @@ class Received:
     """What one read of a link brought: raw chunks, and the samples that became complete with their arrival.
 
     Arrival times are nanoseconds of the host's monotonic clock.
+    stream: of a device with several streams, the index of the one that samples, gaps and drops belong to.
+    files: name and content of what the device keeps about itself (its calibration) and a recording should have.
     """
 
     chunks: Sequence[Chunk] = ()
     samples: tuple[tuple[int, Sample], ...] = ()
     events: tuple[DeviceEvent, ...] = ()
+    stream: int = 0
+    files: tuple[tuple[str, bytes], ...] = ()

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.model import Calibration, CalibrationError, dump, load_calibration, validate
-from drivers.device import DeviceError, Driver, received
+from drivers.device import DeviceError, Driver, StreamSpec, received
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, ScanSample
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.pipeline import DeviceInTake, Pipeline, count_event
@@ -92,7 +92,7 @@ def record(
     required devices that are missing; StorageError when the files can't be finished.
     """
     drivers = {device.name: device.driver.create(device.name, device.config) for device in rig.devices}
-    calibration = _calibration(rig, _cameras(rig, drivers))
+    calibration = _calibration(rig, _cameras(_streams(rig, drivers)))
     bytes_per_s = sum(stream.bytes_per_s for driver in drivers.values() for stream in driver.streams)
     check_output(out, bytes_per_s)
     connected = _connect(rig, drivers, stop, on_event)
@@ -106,14 +106,36 @@ def record(
     return folder, take.run(duration_s, stop, on_status)
 
 
-def _cameras(rig: Rig, drivers: dict[str, Driver]) -> list[RigDevice]:
-    """Camera devices in the order of their index: first all on the clock of the first one, then the other clocks'."""
-    cameras = [device for device in rig.devices if drivers[device.name].streams[0].kind == "frames"]
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    """One stream of a device, by the name it has in the recording."""
+
+    name: str
+    device: RigDevice
+    spec: StreamSpec
+
+    @property
+    def clock(self) -> str:
+        """Name of the clock that stamps it."""
+        return self.device.clock
+
+
+def _streams(rig: Rig, drivers: dict[str, Driver]) -> list[_Stream]:
+    return [
+        _Stream(f"{device.name}.{spec.name}" if spec.name else device.name, device, spec)
+        for device in rig.devices
+        for spec in drivers[device.name].streams
+    ]
+
+
+def _cameras(streams: list[_Stream]) -> list[_Stream]:
+    """Cameras in the order of their index: first all on the clock of the first one, then the other clocks'."""
+    cameras = [stream for stream in streams if stream.spec.kind == "frames"]
     clocks = list(dict.fromkeys(camera.clock for camera in cameras))
     return sorted(cameras, key=lambda camera: clocks.index(camera.clock))
 
 
-def _calibration(rig: Rig, cameras: list[RigDevice]) -> bytes | None:
+def _calibration(rig: Rig, cameras: list[_Stream]) -> bytes | None:
     if rig.calibration is None:
         return None
     try:
@@ -126,7 +148,7 @@ def _calibration(rig: Rig, cameras: list[RigDevice]) -> bytes | None:
     return dump(calibration)
 
 
-def _too_few(calibration: Calibration, cameras: list[RigDevice]) -> list[str]:
+def _too_few(calibration: Calibration, cameras: list[_Stream]) -> list[str]:
     cameras = [camera for camera in cameras if camera.clock == cameras[0].clock]  # clients take these
     if len(calibration.cameras) >= len(cameras):
         return []
@@ -204,9 +226,13 @@ class Take:
         self._is_merged = False
         self._inbox: ByteQueue[tuple[str, Received]] = ByteQueue(INBOX_BYTES)
         self._start_ns = time.monotonic_ns()
-        cameras = _cameras(rig, drivers)
-        self._devices = {device.name: _in_take(device, drivers[device.name], cameras) for device in rig.devices}
-        self._manifest = self._new_manifest(rig, folder.name, [camera.name for camera in cameras])
+        streams = _streams(rig, drivers)
+        cameras = _cameras(streams)
+        self._names = {
+            device.name: tuple(stream.name for stream in streams if stream.device is device) for device in rig.devices
+        }
+        self._devices = {stream.name: _in_take(stream, drivers[stream.device.name], cameras) for stream in streams}
+        self._manifest = self._new_manifest(rig, folder.name, streams, cameras)
         self._writer = RecordingWriter(
             folder,
             self._manifest,
@@ -222,34 +248,35 @@ class Take:
             self._writer,
             list(self._devices.values()),
             self._start_ns,
-            _half_period_ns(cameras, drivers),
+            _half_period_ns(cameras),
             inline_refit=False,
         )
         self._folder = folder
         self._last_counts: dict[str, int] = {}
         self._last_status_s = time.monotonic()
 
-    def _new_manifest(self, rig: Rig, name: str, cameras: list[str]) -> Manifest:
+    def _new_manifest(self, rig: Rig, name: str, streams: list[_Stream], cameras: list[_Stream]) -> Manifest:
         return new_manifest(
             name,
             start_monotonic_ns=self._start_ns,
             utc_ns=time.time_ns() - (time.monotonic_ns() - self._start_ns),
             utc_source="host clock",
-            cameras=cameras,
-            devices={device.name: self._device_summary(device) for device in rig.devices},
+            cameras=[camera.name for camera in cameras],
+            devices={stream.name: self._device_summary(stream) for stream in streams},
             clocks={},
             rig=rig.source,
         )
 
-    def _device_summary(self, device: RigDevice) -> DeviceSummary:
+    def _device_summary(self, stream: _Stream) -> DeviceSummary:
+        driver = self._drivers[stream.device.name]
         return DeviceSummary(
-            driver=device.config.driver,
-            clock=device.clock,
-            latency_s=device.config.latency_s,
-            identity=self._drivers[device.name].identity,
-            stream=self._devices[device.name].summary,
-            tick_hz=self._drivers[device.name].tick_hz,
-            wrap_bits=self._drivers[device.name].wrap_bits,
+            driver=stream.device.config.driver,
+            clock=stream.device.clock,
+            latency_s=stream.device.config.latency_s,
+            identity=driver.identity,
+            stream=self._devices[stream.name].summary,
+            tick_hz=driver.tick_hz,
+            wrap_bits=driver.wrap_bits,
         )
 
     # -- threads --
@@ -258,7 +285,7 @@ class Take:
         """Record until stopped; closes everything and gives the manifest as written."""
         readers = [
             threading.Thread(target=self._guard, args=(name, self._read_device, name), name=name, daemon=True)
-            for name in self._devices
+            for name in self._drivers
         ]
         merger = threading.Thread(target=self._guard, args=("merge", self._merge), name="merge", daemon=True)
         refitter = threading.Thread(target=self._guard, args=("clocks", self._refit), name="clocks", daemon=True)
@@ -297,21 +324,24 @@ class Take:
         """Hand over all that a device sends until the take stops."""
         burst = 0  # samples without room since there was room
         for item in received(self._drivers[name], self._stop_reading, connected=name in self._connected):
+            stream = self._names[name][item.stream]
             self._writer.raw.put_chunks(name, item.chunks)
+            for file_name, data in item.files:
+                self._writer.raw.put_file(name, file_name, data)
             for event in item.events:
-                self._note(name, event)
+                self._note(name, stream, event)
             if not item.samples and not _is_connected(item):
                 continue
-            if self._inbox.offer((name, item), _size(item)):
+            if self._inbox.offer((stream, item), _size(item)):
                 self._note_burst(name, burst)
                 burst = 0
                 continue
             if not burst:
-                self._note(name, DeviceEvent("warning", "the recorder is too slow: samples are dropped"))
+                self._note(name, stream, DeviceEvent("warning", "the recorder is too slow: samples are dropped"))
             burst += len(item.samples)
             placeholders = _placeholders(item)
-            self._devices[name].summary.dropped += len(item.samples) - len(placeholders.samples)
-            self._inbox.force((name, placeholders))
+            self._devices[stream].summary.dropped += len(item.samples) - len(placeholders.samples)
+            self._inbox.force((stream, placeholders))
         self._note_burst(name, burst)
 
     def _note_burst(self, name: str, count: int) -> None:
@@ -320,14 +350,17 @@ class Take:
             self._writer.events.write(name, "drop", text, count)
             self._on_event(name, DeviceEvent("drop", text, count))
 
-    def _note(self, name: str, event: DeviceEvent) -> None:
-        """Write an event down, count what it says was lost, and tell the user."""
-        count_event(self._devices[name].summary, event)
+    def _note(self, name: str, stream: str, event: DeviceEvent) -> None:
+        """Write an event of a device down, count what it says its stream has lost, and tell the user."""
+        count_event(self._devices[stream].summary, event)
         if event.kind == "connected":
             self._connected.add(name)
-            self._manifest.devices[name].identity = self._drivers[name].identity
+            for each in self._names[name]:
+                self._manifest.devices[each].identity = self._drivers[name].identity
         elif event.kind == "lost":
             self._connected.discard(name)
+        elif event.count:
+            name = stream
         self._writer.events.write(name, event.kind, event.text, event.count)
         self._on_event(name, event)
 
@@ -372,7 +405,7 @@ class Take:
         """Clock -> (device, key in the store), of the first device on each that has a serial number."""
         keys: dict[str, tuple[str, str]] = {}
         for name, device in self._devices.items():
-            key = device_key(device.config.driver, self._drivers[name].identity)
+            key = device_key(device.config.driver, self._manifest.devices[name].identity)
             if key is not None:
                 keys.setdefault(device.clock, (name, key))
         return keys
@@ -422,6 +455,7 @@ class Take:
         interval_s = max(now_s - self._last_status_s, 1e-3)
         self._last_status_s = now_s
         devices = []
+        connected = {stream for name, streams in self._names.items() if name in self._connected for stream in streams}
         for name, device in self._devices.items():
             summary = device.summary
             rate_hz = (summary.received - self._last_counts.get(name, 0)) / interval_s
@@ -430,7 +464,7 @@ class Take:
             devices.append(
                 DeviceStatus(
                     name, summary.kind, rate_hz, summary.received, summary.lost, summary.dropped, lag_s,
-                    name in self._connected,
+                    name in connected,
                 )
             )  # fmt: skip
         elapsed_s = (time.monotonic_ns() - self._start_ns) / NS_PER_S
@@ -466,21 +500,20 @@ def suspended_ns() -> int:
     return min(readings)[1]
 
 
-def _in_take(device: RigDevice, driver: Driver, cameras: list[RigDevice]) -> DeviceInTake:
-    stream = driver.streams[0]
+def _in_take(stream: _Stream, driver: Driver, cameras: list[_Stream]) -> DeviceInTake:
     return DeviceInTake(
-        name=device.name,
-        config=device.config,
-        clock=device.clock,
+        name=stream.name,
+        config=stream.device.config,
+        clock=stream.device.clock,
         tick_hz=driver.tick_hz,
         wrap_bits=driver.wrap_bits,
-        camera=cameras.index(device) if device in cameras else None,
-        summary=StreamSummary(stream.kind, stream.rate_hz),
+        camera=cameras.index(stream) if stream in cameras else None,
+        summary=StreamSummary(stream.spec.kind, stream.spec.rate_hz),
     )
 
 
-def _half_period_ns(cameras: list[RigDevice], drivers: dict[str, Driver]) -> int:
-    rates_hz = [drivers[camera.name].streams[0].rate_hz or 30.0 for camera in cameras]
+def _half_period_ns(cameras: list[_Stream]) -> int:
+    rates_hz = [camera.spec.rate_hz or 30.0 for camera in cameras]
     return round(0.5 * NS_PER_S / max(rates_hz, default=30.0))
 
 

@@ -234,6 +234,11 @@ def _expected_rates(manifest: Manifest | None) -> dict[str, float]:
         devices = [device.stream for device in manifest.devices.values() if device.stream.kind == kind]
         if kind != "frames" and len(devices) == 1 and devices[0].rate_hz:
             rates |= dict.fromkeys(streams, devices[0].rate_hz)
+        elif kind == "imu":
+            for sensor in streams:
+                sources = [device.rate_hz for device in devices if device.sensor_lines.get(sensor)]
+                if len(sources) == 1 and sources[0]:
+                    rates[sensor] = sources[0]
     for index, name in enumerate(manifest.cameras):
         rate_hz = manifest.devices[name].stream.rate_hz if name in manifest.devices else None
         if rate_hz:

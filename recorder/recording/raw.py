@@ -16,6 +16,8 @@ its ticks and stamped anew.
 - The pictures of a frame set have the stamp of their line, a lost one too.
 - Samples without device time have no row.
 
+raw/DEVICE.NAME with other names are small files that the device keeps about itself, as it gave them (its calibration).
+
 raw/DEVICE.refined holds one int64 for each row of DEVICE.clock: its time after refinement (see recorder.resync).
 """
 
@@ -167,7 +169,8 @@ class RawWriter:
         self._offset_ns = utc_minus_monotonic_ns
         self._tape = tape
         self._tapes: dict[str, TapeFile] = {}
-        self._pair_files: dict[str, HashedFile] = {}
+        self._plain_files: dict[str, HashedFile] = {}
+        self._kept: set[str] = set()
         self._queue: ByteQueue[tuple[str, Sequence[Chunk] | bytes]] = ByteQueue(QUEUE_BYTES)
         self._on_error = on_error
         self._thread = start_thread("raw", self._run, self._failed)
@@ -183,17 +186,23 @@ class RawWriter:
     def put_clock_rows(self, device: str, pairs: npt.NDArray[np.int64]) -> None:
         """Take (n, 3) int64 rows of the clock table: ticks, arrival, online stamp."""
         data = pairs.astype("<i8").tobytes()
-        if not self._queue.offer((device, data), len(data)):
+        if not self._queue.offer((f"{device}.clock", data), len(data)):
             self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + len(data)
+
+    def put_file(self, device: str, name: str, data: bytes) -> None:
+        """Take a small file of a device, the first time it comes; waits for room."""
+        if f"{device}.{name}" not in self._kept:
+            self._kept.add(f"{device}.{name}")
+            self._queue.put((f"{device}.{name}", data), len(data))
 
     def _run(self) -> None:
         last_sync_s = time.monotonic()
         while not self._queue.ended:
-            for device, item in self._queue.get_all(FLUSH_S):
+            for name, item in self._queue.get_all(FLUSH_S):
                 if isinstance(item, bytes):
-                    self._pair_file(device).write(item)
+                    self._plain_file(name).write(item)
                 else:
-                    tape = self._tape_file(device, item[0])
+                    tape = self._tape_file(name, item[0])
                     if isinstance(item, Datagrams):
                         tape.write_many(item)
                     else:
@@ -210,7 +219,7 @@ class RawWriter:
 
     def _files(self) -> dict[str, HashedFile]:
         tapes = {f"{FOLDER}/{device}.pcapng": tape.file for device, tape in self._tapes.items()}
-        return tapes | {f"{FOLDER}/{device}.clock": file for device, file in self._pair_files.items()}
+        return tapes | {f"{FOLDER}/{name}": file for name, file in self._plain_files.items()}
 
     def _tape_file(self, device: str, first: Chunk) -> TapeFile:
         if device not in self._tapes:
@@ -219,10 +228,10 @@ class RawWriter:
             self._tapes[device] = TapeFile(path, is_serial=is_serial, utc_minus_monotonic_ns=self._offset_ns)
         return self._tapes[device]
 
-    def _pair_file(self, device: str) -> HashedFile:
-        if device not in self._pair_files:
-            self._pair_files[device] = HashedFile(self._folder / f"{device}.clock")
-        return self._pair_files[device]
+    def _plain_file(self, name: str) -> HashedFile:
+        if name not in self._plain_files:
+            self._plain_files[name] = HashedFile(self._folder / name)
+        return self._plain_files[name]
 
     def _failed(self, name: str, error: Exception) -> None:
         self._on_error(name, error)
