@@ -35,6 +35,8 @@ from simulated_devices.faults import NO_FAULTS, FaultSettings
 from simulated_devices.imu import ImuSimulator
 from simulated_devices.microstrain import MicrostrainSettings, microstrain_simulator
 from simulated_devices.nmea import NmeaSettings, NmeaSimulator
+from simulated_devices.oak import NO_SETUP, OakSettings, OakSetup, OakSimulator, imu_camera
+from simulated_devices.oak_pictures import rig_cameras
 from simulated_devices.pose import PoseSettings, PoseSimulator
 from simulated_devices.robosense import LidarSettings, RobosenseSettings, RobosenseSimulator
 from simulated_devices.robosense_imu import RobosenseImuSettings, RobosenseImuSimulator
@@ -48,6 +50,7 @@ from simulated_devices.xsens import XsensSettings, xsens_simulator
 log = logging.getLogger(__name__)
 
 BUILT_IN = "built-in rig"
+BUILT_IN_RIGS = ("rig", "oak")
 OPENING_NS = 5 * SECOND_NS
 _EXIT_S = 0.5
 _ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -69,7 +72,8 @@ class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The `simulate` keys of a rig.
 
     jitter: factor on all transport jitter and bursts. skew_ppm: bound of the skew each clock draws.
-    faults: what goes wrong with each device, by its name. lidars: how each simulated lidar is set up, by its name.
+    faults: what goes wrong with each device, by its name. lidars, oaks: how each simulated lidar or OAK is set up, by
+    its name. rig: which of the packaged rigs, where no file is given.
     scene: "room", or "board" for cameras that are held before a calibration board (the trajectory is then one of its
     own). board: which one. lens: model of the cameras that look at it.
     """
@@ -80,6 +84,8 @@ class SimulateSettings(msgspec.Struct, frozen=True, kw_only=True):
     skew_ppm: float = 50.0
     faults: dict[str, FaultSettings] = {}
     lidars: dict[str, LidarSettings] = {}
+    oaks: dict[str, OakSetup] = {}
+    rig: str = BUILT_IN_RIGS[0]
     scene: Literal["room", "board"] = "room"
     board: str = DEFAULT_BOARD
     lens: Literal["pinhole", "brown-conrady", "kannala-brandt4"] = "pinhole"
@@ -117,10 +123,10 @@ class DeviceDiedError(Exception):
 
 
 def read_rig(path: Path | None, settings: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The rig file, or the built-in rig, with `key.path=value` settings applied. Raises ConfigError."""
+    """The rig file, or a built-in rig, with `key.path=value` settings applied. Raises ConfigError."""
     origin = str(path) if path else BUILT_IN
     try:
-        text = (path or files("simulated_devices").joinpath("rig.yaml")).read_text(encoding="utf-8")
+        text = (path or files("simulated_devices").joinpath(_built_in(settings))).read_text(encoding="utf-8")
         source = yaml.safe_load(text)
     except OSError as error:
         raise ConfigError(f"{origin}: cannot read: {error.strerror}") from error
@@ -129,6 +135,15 @@ def read_rig(path: Path | None, settings: tuple[str, ...] = ()) -> dict[str, Any
     if not isinstance(source, dict):
         raise ConfigError(f"{origin}: must be a mapping with the keys simulate and devices")
     return apply_settings(source, settings)
+
+
+def _built_in(settings: tuple[str, ...]) -> str:
+    """File of the packaged rig that the settings ask for."""
+    simulate = apply_settings({}, settings).get("simulate")
+    name = simulate.get("rig", BUILT_IN_RIGS[0]) if isinstance(simulate, dict) else BUILT_IN_RIGS[0]
+    if name not in BUILT_IN_RIGS:
+        raise ConfigError(f"simulate.rig: no built-in rig {name!r}; there are: {', '.join(BUILT_IN_RIGS)}")
+    return f"{name}.yaml"
 
 
 def simulate_settings(source: Mapping[str, Any]) -> SimulateSettings:
@@ -233,12 +248,14 @@ class Cast:
         self.ports = UdpPorts()
         self._faults = settings.faults
         self.lidars = settings.lidars
+        self._oaks = settings.oaks
         self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
             **dict.fromkeys(IMUS, self._imu),
             "nmea": self._nmea,
             "robosense": self._robosense,
             "robosense-imu": self._robosense_imu,
             "stream": self._stream,
+            "oak": self._oak,
             "pose": self._pose,
         }
 
@@ -292,7 +309,7 @@ class Cast:
         settings = _convert(entry, CameraSettings, f"devices.{name}")
         if name in self._faults:
             raise ValueError(f"simulate.faults.{name}: a simulated camera has no faults")
-        if len(self.cameras) == 2:
+        if len(self.cameras) >= 2:
             raise ValueError(f"devices.{name}: a simulated rig has at most two cameras")
         for key in ("width", "height"):
             if getattr(settings, key) % 2 or not 32 <= getattr(settings, key) <= 4096:
@@ -303,6 +320,18 @@ class Cast:
         camera = pair[len(self.cameras)]
         self.cameras.append(camera)
         return CameraSimulator(name, settings, self.stage, self.trajectory, self.scene, camera)
+
+    def _oak(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
+        settings = _convert(entry, OakSettings, f"devices.{name}")
+        cameras = rig_cameras(settings)
+        if cameras and self.cameras:
+            raise ValueError(f"devices.{name}: a simulated rig has one stereo pair, and there is another one")
+        if self._lens != "pinhole":
+            raise ValueError(f"devices.{name}: a simulated OAK has pinhole cameras only, not simulate.lens: {self._lens}")
+        has_imu = settings.imu_rate_hz > 0  # then poses are told with respect to that
+        self.cameras += [imu_camera(camera, settings.imu_variant) if has_imu else camera for camera in cameras.values()]
+        faults, setup = self.faults(name, is_serial=False), self._oaks.get(name, NO_SETUP)
+        return OakSimulator(name, settings, self.stage, self.trajectory, self.scene, faults, setup)
 
     def _pose(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = self._with_ports(name, _convert(entry, PoseSettings, f"devices.{name}"), ("port",))
@@ -432,7 +461,7 @@ def simulated_rig(source: dict[str, Any], *, report: bool = False) -> Simulation
     if not isinstance(entries, dict) or not entries:
         raise ConfigError("devices: a mapping of at least one device is needed")
     settings = simulate_settings(source)
-    for key, names in (("faults", settings.faults), ("lidars", settings.lidars)):
+    for key, names in (("faults", settings.faults), ("lidars", settings.lidars), ("oaks", settings.oaks)):
         for name in names:
             if name not in entries:
                 there = ", ".join(map(str, entries))

@@ -3,7 +3,8 @@
     backend ──▶ OakLink: queues of depthai messages, calibration, facts ──▶ oak_messages ──▶ samples
 
 The backend opens the device and sets it up; it is found by name through the entry point group `rigtape.oak_backends`.
-`depthai` (drivers.cameras.oak_device) is the one for devices; another package can add one that feeds the same queues.
+`depthai` (drivers.cameras.oak_device) is the one for devices; another package can add one that feeds the same queues
+and raises OSError when it cannot.
 
 Encoded pictures go on as they come from the device. Queues are read in one thread and block when they are full, so
 that what finds no room is missing in the device's own numbers and is counted.
@@ -144,7 +145,11 @@ class OakDriver:
     def connect(self) -> None:
         """Open the device and start it. Raises DeviceError with what is attached."""
         self.close()
-        self._link = _backend(self._config.backend)(self._config)
+        open_device = _backend(self._config.backend)
+        try:
+            self._link = open_device(self._config)
+        except OSError as error:
+            raise DeviceError(f"OAK {self._config.id}: cannot be opened: {error}") from error
 
     def read(self, stop: Event) -> Iterator[Received]:
         """Yield what the queues bring. Raises DeviceError when the device is gone or silent."""
