@@ -25,6 +25,8 @@ from simulated_devices.board_scene import renderer
 from simulated_devices.camera import ClientStream, PictureEncoder
 from simulated_devices.lidar_scan import World
 from simulated_devices.nmea import ORIGIN, SIGMA_M
+from simulated_devices.oak import ACCEL_AFTER_GYRO_NS, IMU_FROM_RIG, OakSettings
+from simulated_devices.oak_pictures import OakEncoder, rig_cameras
 from simulated_devices.pose import quaternion
 from simulated_devices.rig import IMUS, Cast, calibration, simulate_settings
 from simulated_devices.robosense import IMU_FROM_LIDAR, make_lidar
@@ -42,6 +44,11 @@ TWIN_UTC_NS = 1_767_225_600 * SECOND_NS  # a date, so that the same seed gives t
 RADIUS_UNIT_M = np.float32(0.005)
 ANGLE_ZERO = 32768
 LIDAR_NAMES = {"airy": "Airy", "helios32": "Helios 32", "helios16p": "Helios 16P"}
+OAK_VIDEO = {
+    "h264": ("h264", "yuv420p"), "h265": ("hevc", "yuv420p"), "mjpeg": ("mjpeg", "yuvj420p"),
+    "raw": ("rawvideo", "gray"),
+}  # fmt: skip
+OAK_EXPOSURE_NS = 3_000_000
 BATCH = 100
 PROGRESS_NS = 5 * SECOND_NS
 
@@ -62,6 +69,7 @@ class Twin:
                 self._cast.device(str(name), entry)  # refuses what cannot be simulated, and places the cameras
         finally:
             self._cast.ports.close()  # nothing is sent
+        self.streams: dict[str, tuple[str, str, float]] = {}  # driver, kind and rate by the name in the recording
         for name, entry in entries.items():
             if entry["driver"] == "robosense-imu":
                 raise ConfigError(f"devices.{name}: an ideal twin cannot be written of a lidar's IMU")
@@ -69,13 +77,16 @@ class Twin:
                 raise ConfigError(f"devices.{name}: an ideal twin can only be written of a lidar as it comes")
         self._duration_ns = round(duration_s * SECOND_NS)
         self.entries: dict[str, dict[str, Any]] = entries
-        self.cameras = [name for name, entry in entries.items() if entry["driver"] == "stream"]
+        for name, entry in entries.items():
+            self.streams |= _streams(name, entry)
+        self.cameras = [name for name, (_, kind, _) in self.streams.items() if kind == "frames"]
         self.calibration = calibration(self._cast.cameras)
         makers = {
             **dict.fromkeys(IMUS, self._imu),
             "nmea": self._gnss,
             "robosense": self._lidar,
             "stream": self._camera,
+            "oak": self._oak,
             "pose": self._pose,
         }
         self._streams = [makers[entry["driver"]](order, name) for order, (name, entry) in enumerate(entries.items())]
@@ -147,6 +158,40 @@ class Twin:
                 sample = FrameSample(time_ns, bytes(packet), bool(packet.is_keyframe), video, exposure_s)
                 yield time_ns, order, name, sample
 
+    def _oak(self, order: int, name: str) -> Iterator[Item]:
+        settings = msgspec.convert(self.entries[name], OakSettings)
+        streams = [self._oak_pictures(order, name, settings, camera) for camera in rig_cameras(settings)]
+        if settings.imu_rate_hz:
+            streams += [self._oak_imu(order, name, settings, sensor) for sensor in ("accel", "gyro")]
+        return merge(*streams, key=lambda item: item[:2])
+
+    def _oak_imu(self, order: int, name: str, settings: OakSettings, sensor: str) -> Iterator[Item]:
+        stage = self._cast.stage
+        seed = stage.seed_for("imu", name, sensor)
+        imu = NoisyImu(self._cast.trajectory, ImuNoise(), settings.imu_rate_hz, seed)
+        rotation = IMU_FROM_RIG[settings.imu_variant]
+        after_ns = ACCEL_AFTER_GYRO_NS if sensor == "accel" else 0
+        for times_ns in (batch + after_ns for batch in self._times(name, settings.imu_rate_hz)):
+            gyro, accel = imu.read(_world_s(times_ns))
+            values = (accel if sensor == "accel" else gyro) @ rotation.T
+            for time_ns, vector in zip(times_ns.tolist(), map(tuple, values.tolist()), strict=True):
+                sensors = (vector, None) if sensor == "accel" else (None, vector)
+                yield time_ns, order, f"{name}.{sensor}", ImuSample(None, time_ns, *sensors)
+
+    def _oak_pictures(self, order: int, name: str, settings: OakSettings, camera: str) -> Iterator[Item]:
+        lens = rig_cameras(settings)[camera]
+        draw = renderer(self._cast.scene, lens, self._cast.stage.seed_for("camera", name, camera))
+        encoder = OakEncoder(settings, lens.width, lens.height, is_color=camera == "color")
+        codec, pixels = OAK_VIDEO[settings.encoding]
+        video = VideoFormat(codec, lens.width, lens.height, settings.fps, pixels)
+        for ends_ns in self._times(name, settings.fps):
+            times_ns = ends_ns[ends_ns >= OAK_EXPOSURE_NS // 2] - OAK_EXPOSURE_NS // 2
+            rotation, position_m = self._cast.trajectory.pose(_world_s(times_ns))
+            for index, time_ns in enumerate(times_ns.tolist()):
+                packet, is_keyframe = encoder.encode(draw.render(rotation[index], position_m[index]))
+                sample = FrameSample(time_ns, packet, is_keyframe, video, OAK_EXPOSURE_NS * 1e-9)
+                yield time_ns, order, f"{name}.{camera}", sample
+
     def _lidar(self, order: int, name: str) -> Iterator[Item]:
         model = self.entries[name].get("model", "m1")
         world = World(self._cast.room, self._cast.trajectory, IMU_FROM_LIDAR, self._cast.stage.seed_for("lidar", name))
@@ -212,6 +257,23 @@ def imu_rate_hz(entry: dict[str, Any]) -> float:
     return float(entry.get("rate_hz", msgspec.structs.asdict(settings())["rate_hz"]))
 
 
+def _streams(name: str, entry: dict[str, Any]) -> dict[str, tuple[str, str, float]]:
+    """Driver, kind and rate of each stream of a device, by its name in the recording."""
+    driver = entry["driver"]
+    if driver == "oak":
+        settings = msgspec.convert(entry, OakSettings)
+        streams = {f"{name}.{camera}": (driver, "frames", settings.fps) for camera in settings.cameras}
+        sensors = ("accel", "gyro") if settings.imu_rate_hz else ()
+        return streams | {f"{name}.{sensor}": (driver, "imu", float(settings.imu_rate_hz)) for sensor in sensors}
+    if driver in IMUS:
+        return {name: (driver, "imu", imu_rate_hz(entry))}
+    kind, key, rate_hz = {
+        "nmea": ("gnss", "rate_hz", 10), "robosense": ("lidar", "", 10), "stream": ("frames", "fps", 20),
+        "pose": ("pose", "rate_hz", 100),
+    }[driver]  # fmt: skip
+    return {name: (driver, kind, float(entry.get(key, rate_hz)))}
+
+
 def write_ideal(source: dict[str, Any], folder: Path, duration_s: float) -> None:
     """Write the twin of a rig into a folder that is empty or not there yet. Raises RecorderError."""
     if folder.exists() and any(folder.iterdir()):
@@ -219,15 +281,10 @@ def write_ideal(source: dict[str, Any], folder: Path, duration_s: float) -> None
     twin = Twin(source, duration_s)
     folder.mkdir(parents=True, exist_ok=True)
     errors: list[str] = []
-    kinds = {**dict.fromkeys(IMUS, "imu"), "nmea": "gnss", "robosense": "lidar", "stream": "frames", "pose": "pose"}
-    rates = {"gnss": ("rate_hz", 10), "frames": ("fps", 20), "pose": ("rate_hz", 100)}
-    devices = {}
-    for name, entry in twin.entries.items():
-        kind = kinds[entry["driver"]]
-        rate_hz = float(entry.get(*rates[kind])) if kind in rates else 10.0
-        if kind == "imu":
-            rate_hz = imu_rate_hz(entry)
-        devices[name] = DeviceSummary(entry["driver"], "true time", 0.0, {}, StreamSummary(kind, rate_hz))
+    devices = {
+        name: DeviceSummary(driver, "true time", 0.0, {}, StreamSummary(kind, rate_hz))
+        for name, (driver, kind, rate_hz) in twin.streams.items()
+    }
     manifest = new_manifest(
         folder.name, start_monotonic_ns=0, utc_ns=TWIN_UTC_NS, utc_source="simulated", cameras=twin.cameras,
         devices=devices, clocks={}, rig=source,

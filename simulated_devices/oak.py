@@ -46,7 +46,7 @@ IMU_DELAY = DelayModel(
 IMU_FROM_RIG = {
     "uncalibrated": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),  # right, down, forward
     "calibrated": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-    "raw": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
+    "raw": np.eye(3),
 }
 ACCEL_AFTER_GYRO_NS = 400_000
 FIRST_NUMBER = {"left": 0, "right": 1, "color": 5}  # the cameras do not begin to count at the same picture

@@ -327,7 +327,9 @@ class Cast:
         if cameras and self.cameras:
             raise ValueError(f"devices.{name}: a simulated rig has one stereo pair, and there is another one")
         if self._lens != "pinhole":
-            raise ValueError(f"devices.{name}: a simulated OAK has pinhole cameras only, not simulate.lens: {self._lens}")
+            raise ValueError(
+                f"devices.{name}: a simulated OAK has pinhole cameras only, not simulate.lens: {self._lens}"
+            )
         has_imu = settings.imu_rate_hz > 0  # then poses are told with respect to that
         self.cameras += [imu_camera(camera, settings.imu_variant) if has_imu else camera for camera in cameras.values()]
         faults, setup = self.faults(name, is_serial=False), self._oaks.get(name, NO_SETUP)
