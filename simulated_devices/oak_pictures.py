@@ -22,8 +22,9 @@ from simulated_devices.world import FloatArray, Trajectory
 
 BITS, BLOCK_PX = 32, 16
 NEUTRAL_CHROMA = 128
-_LOOKAHEAD_S = 0.3
+_LOOKAHEAD_NS = 300 * MILLISECOND_NS
 _BEHIND_NS = 300 * MILLISECOND_NS
+_DRAWN = 200
 CODECS = {
     "h264": ("libx264", {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "repeat-headers=1"}),
     "h265": (
@@ -149,7 +150,7 @@ class PictureMaker:
         loop: so many pictures are drawn once and sent again and again, numbered; 0: all are drawn. stamped: the host
         time of the exposure's middle is drawn into each picture, in units of 0.1 ms.
         """
-        self.drawn: queue.Queue[Drawn] = queue.Queue(maxsize=max(4, round(_LOOKAHEAD_S * request.fps)) * 3)
+        self.drawn: queue.Queue[Drawn] = queue.Queue(maxsize=_DRAWN)
         self.skipped = 0
         self._exposure, self._next, self._views = exposure, first, views
         self._loop, self._stamped = loop, stamped
@@ -169,15 +170,20 @@ class PictureMaker:
         looped: list[dict[str, tuple[bytes, bool]]] = []
         for index in range(self._loop):
             looped.append(self._encoded(self._exposure(self._next), index))
+        first_sent: int | None = None
         while not self._stopped.is_set():
             exposure = self._exposure(self._next)
             late_ns = time.monotonic_ns() - exposure.end_host_ns
+            if late_ns < -_LOOKAHEAD_NS:
+                self._stopped.wait((-_LOOKAHEAD_NS - late_ns) * 1e-9)
+                continue
             self._next += 1
             if late_ns > _BEHIND_NS or (looped and late_ns > 0):
                 self.skipped += 1
                 continue
+            first_sent = exposure.index if first_sent is None else first_sent
             if looped:
-                pictures = looped[exposure.index % self._loop]
+                pictures = looped[(exposure.index - first_sent) % self._loop]
             else:
                 pictures = self._encoded(exposure, exposure.middle_host_ns // 100_000 if self._stamped else None)
             for camera, (data, is_keyframe) in pictures.items():

@@ -1,0 +1,206 @@
+"""Cost of recording an OAK-D, and whether its pictures and lines stay in step whatever happens.
+
+    python benchmarks/oak.py [--smoke] [--only passthrough|raw|in-step] [--duration S] [-o DIR]
+
+A simulated OAK in a process of its own sends real depthai messages: a stereo pair of 1280x800 at 30 Hz and an IMU at
+400 Hz. Counted is the CPU of the process that records, in shares of one core, but for the thread that stands for the
+device (it reads a socket and makes the messages, as depthai's own threads do for a real one).
+
+passthrough: H.264 of the device, limit 0.15. raw: gray pictures, encoded here, limit 0.5. Both: nothing may be lost, all
+frame sets complete, and the number drawn into each picture must be the one its line is due.
+in-step: messages get lost, pictures come up to half a period late, the device is unplugged again and again; the host's
+time of each exposure is drawn into its picture and must be the time of its line. --smoke: some seconds of each, and ten
+times the limit.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import yaml
+
+from drivers.device import driver_type
+from recorder.recording.manifest import Manifest
+from recorder.rig import parse_rig
+from recorder.session import record
+from recorder.simulation import SimulatedRig
+from simulated_devices.oak_host import THREAD_NAME
+from simulated_devices.oak_pictures import read_number
+
+LIMITS = {"passthrough": 0.15, "raw": 0.5}
+SMOKE_FACTOR = 10
+LOOP = 60
+FPS = 30
+STAMP_S = 1e-4
+STAMP_WRAP = 1 << 32
+IN_STEP_S = 0.005  # a picture in the place of its neighbour would be off by 0.05 s
+
+
+def rig(mode: str) -> dict[str, Any]:
+    if mode == "in-step":
+        return {
+            "simulate": {
+                "faults": {
+                    "oak": {
+                        "lost_message_rate": 0.005,
+                        "unplug_at_s": 3,
+                        "replug_after_s": 1.5,
+                        "unplug_every_s": 20,
+                    }
+                },
+                "oaks": {"oak": {"stamped": True, "picture_jitter_s": 0.025}},
+            },
+            "devices": {"oak": {"driver": "oak", "fps": 20, "width": 640, "height": 400, "keyframe_every": 10}},
+        }
+    return {
+        "simulate": {"oaks": {"oak": {"loop": LOOP}}},
+        "devices": {"oak": {"driver": "oak", "fps": FPS, "encoding": "raw" if mode == "raw" else "h264"}},
+    }
+
+
+class LinkCpu:
+    """CPU seconds of the threads that stand for the device."""
+
+    def __init__(self) -> None:
+        self._by_thread: dict[int, float] = {}
+
+    def read(self) -> float:
+        for thread in threading.enumerate():
+            if thread.name == THREAD_NAME and thread.native_id is not None:
+                path = Path(f"/proc/self/task/{thread.native_id}/schedstat")
+                if path.exists():
+                    self._by_thread[thread.native_id] = int(path.read_text().split()[0]) * 1e-9
+        return sum(self._by_thread.values())
+
+
+def take(mode: str, duration_s: float, out: Path) -> tuple[Path, Manifest, float, float]:
+    """Record; gives the folder, the manifest, and the shares of a core: of the recorder, of the device's thread."""
+    path = out / f"{mode}.yaml"
+    path.write_text(yaml.safe_dump(rig(mode)))
+    simulated = SimulatedRig(path, ())
+    link = LinkCpu()
+    marks: list[tuple[float, float, float]] = []
+    try:
+        loaded = parse_rig(simulated.yaml, "simulated rig", out)
+
+        def mark(_: object) -> None:
+            marks.append((time.monotonic(), time.process_time(), link.read()))
+
+        folder, manifest = record(
+            loaded, out, name=mode, duration_s=duration_s, stop=threading.Event(), on_status=mark,
+            on_event=lambda device, event: print(f"  {device}: {event.kind}: {event.text}"),
+        )  # fmt: skip
+        ended = (time.process_time(), marks[-1][2])
+    finally:
+        simulated.close()
+    begin = marks[0]
+    elapsed_s = duration_s - (begin[0] - marks[-1][0] + (marks[-1][0] - begin[0]))
+    elapsed_s = marks[-1][0] - begin[0]
+    steady = (marks[-1][1] - begin[1]) - (marks[-1][2] - begin[2])
+    closing_s = ended[0] - marks[-1][1]
+    print(f"  closing the files took {closing_s:.2f} s of CPU")
+    return folder, manifest, (steady + closing_s) / elapsed_s, (marks[-1][2] - begin[2]) / elapsed_s
+
+
+def frames(folder: Path) -> list[dict[str, Any]]:
+    with (folder / "data.jsonl").open() as file:
+        return [line for line in map(json.loads, file) if "frames" in line]
+
+
+def numbers(path: Path) -> Iterator[int]:
+    """The numbers drawn into the pictures of a video."""
+    with av.open(str(path)) as container:
+        container.streams.video[0].thread_type = "NONE"
+        for frame in container.decode(video=0):
+            yield read_number(np.asarray(frame.reformat(format="gray").to_ndarray()))
+
+
+def faults_of_loop(folder: Path, manifest: Manifest) -> list[str]:
+    """What is wrong with a take in which nothing may be missing."""
+    faults = []
+    for name, device in manifest.devices.items():
+        if device.stream.lost or device.stream.dropped or not device.stream.written:
+            faults.append(f"{name}: {device.stream}")
+    lines = frames(folder)
+    if any(entry.get("missingBitmap") for line in lines for entry in line["frames"]):
+        faults.append("there are incomplete frame sets")
+    times_s = np.array([line["time"] for line in lines])
+    left, right = (np.fromiter(numbers(folder / name), dtype=np.int64) for name in ("data.mkv", "data2.mkv"))
+    if not len(left) == len(right) == len(lines):
+        faults.append(f"{len(lines)} lines, {len(left)} and {len(right)} pictures")
+    elif np.any(left != right):
+        faults.append("pairs are not of one exposure")
+    else:
+        steps = np.rint(np.diff(times_s) * FPS).astype(np.int64)
+        if np.any(steps != 1) or np.any(np.diff(left) % LOOP != 1):
+            faults.append("numbers of pictures and times of lines do not go together")
+    print(f"  {len(lines)} lines, {len(left)} + {len(right)} pictures, all pairs of one exposure: {not faults}")
+    return faults
+
+
+def faults_of_steps(folder: Path, manifest: Manifest) -> list[str]:
+    """What is out of step in a take with losses."""
+    faults = []
+    lines = frames(folder)
+    counts = Counter()
+    for camera, name in enumerate(("data.mkv", "data2.mkv")):
+        times_s = [line["time"] for line in lines if not line["frames"][camera].get("missingBitmap")]
+        stamps = np.fromiter(numbers(folder / name), dtype=np.int64)
+        if len(times_s) != len(stamps):
+            faults.append(f"{name}: {len(stamps)} pictures, {len(times_s)} lines")
+            continue
+        host = np.round((np.array(times_s) + manifest.start_monotonic_ns * 1e-9) / STAMP_S).astype(np.int64)
+        apart_s = ((host - stamps + STAMP_WRAP // 2) % STAMP_WRAP - STAMP_WRAP // 2) * STAMP_S
+        if np.abs(apart_s).max(initial=0) > IN_STEP_S:
+            faults.append(f"{name}: a picture is {np.abs(apart_s).max() * 1e3:.1f} ms from its line")
+        print(f"  {name}: {len(stamps)} pictures, line minus exposure {apart_s.mean() * 1e3:+.2f} ms on average, "
+              f"from {apart_s.min() * 1e3:+.2f} to {apart_s.max() * 1e3:+.2f} ms")  # fmt: skip
+    for line in lines:
+        counts["complete" if not any(entry.get("missingBitmap") for entry in line["frames"]) else "incomplete"] += 1
+    lost = {name: (device.stream.lost, device.stream.dropped) for name, device in manifest.devices.items()}
+    print(f"  frame sets: {dict(counts)}; lost, dropped: {lost}; epochs {manifest.clocks['oak'].epochs}")
+    return faults
+
+
+def run(mode: str, duration_s: float, out: Path, *, smoke: bool) -> bool:
+    print(f"{mode}, {duration_s:.0f} s:")
+    folder, manifest, share, link_share = take(mode, duration_s, out)
+    faults = faults_of_steps(folder, manifest) if mode == "in-step" else faults_of_loop(folder, manifest)
+    limit = LIMITS.get(mode)
+    size_mb = sum(path.stat().st_size for path in folder.glob("*.mkv")) / 1e6
+    verdict = "" if limit is None else f" (limit {limit})"
+    print(f"  {share:.3f} of a core{verdict}, device's thread {link_share:.3f} apart; {size_mb:.0f} MB of video")
+    if limit is not None and share > limit * (SMOKE_FACTOR if smoke else 1):
+        faults.append(f"{share:.3f} of a core is more than {limit}")
+    for fault in faults:
+        print(f"  FAULT {fault}")
+    return not faults
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--only", choices=("passthrough", "raw", "in-step"))
+    parser.add_argument("--duration", type=float)
+    parser.add_argument("-o", "--output", type=Path)
+    options = parser.parse_args()
+    driver_type("oak")  # so that importing depthai is not counted
+    modes = [options.only] if options.only else ["passthrough", "raw", "in-step"]
+    with tempfile.TemporaryDirectory() as temporary:
+        out = options.output or Path(temporary)
+        out.mkdir(parents=True, exist_ok=True)
+        good = [run(mode, options.duration or (6 if options.smoke else 20), out, smoke=options.smoke) for mode in modes]
+    return 0 if all(good) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
