@@ -6,8 +6,8 @@ A simulated OAK in a process of its own sends real depthai messages: a stereo pa
 400 Hz. Counted is the CPU of the process that records, in shares of one core, but for the thread that stands for the
 device (it reads a socket and makes the messages, as depthai's own threads do for a real one).
 
-passthrough: H.264 of the device, limit 0.15. raw: gray pictures, encoded here, limit 0.5. Both: nothing may be lost, all
-frame sets complete, and the number drawn into each picture must be the one its line is due.
+passthrough: H.264 of the device, limit 0.15. raw: gray pictures, encoded here, limit 0.5. Both: nothing may be lost,
+all frame sets complete, and the number drawn into each picture must be the one its line is due.
 in-step: messages get lost, pictures come up to half a period late, the device is unplugged again and again; the host's
 time of each exposure is drawn into its picture and must be the time of its line. --smoke: some seconds of each, and ten
 times the limit.
@@ -103,7 +103,6 @@ def take(mode: str, duration_s: float, out: Path) -> tuple[Path, Manifest, float
     finally:
         simulated.close()
     begin = marks[0]
-    elapsed_s = duration_s - (begin[0] - marks[-1][0] + (marks[-1][0] - begin[0]))
     elapsed_s = marks[-1][0] - begin[0]
     steady = (marks[-1][1] - begin[1]) - (marks[-1][2] - begin[2])
     closing_s = ended[0] - marks[-1][1]

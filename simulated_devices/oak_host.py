@@ -6,11 +6,15 @@ into the queues that the driver reads.
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 from contextlib import suppress
 from datetime import timedelta
 from typing import Any
+
+os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
+os.environ.setdefault("DEPTHAI_LEVEL", "error")
 
 import depthai as dai
 import msgspec

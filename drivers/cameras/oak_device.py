@@ -57,7 +57,7 @@ CODED_BITS_PER_PIXEL = {"h264": 1.2, "h265": 0.8, "mjpeg": 3.2}
 class OakDevice:
     """An opened and started device: see `drivers.cameras.oak.OakLink`."""
 
-    def __init__(self, device: Any, config: "OakConfig", is_network: bool) -> None:
+    def __init__(self, device: dai.Device, config: "OakConfig", is_network: bool) -> None:
         """Build and start the pipeline. Raises DeviceError for what it lacks, RuntimeError from depthai."""
         self._device = device
         cameras = {feature.socket: feature for feature in device.getConnectedCameraFeatures()}
@@ -111,12 +111,12 @@ def open_device(config: "OakConfig") -> OakDevice:
         raise
 
 
-def _close(device: Any) -> None:
+def _close(device: dai.Device) -> None:
     with suppress(RuntimeError):
         device.close()
 
 
-def _find(device_id: str) -> tuple[Any, bool]:
+def _find(device_id: str) -> tuple[dai.DeviceInfo, bool]:
     """The device of that id, address or port, and whether it is on the network.
 
     depthai would wait ten seconds for a device that is not there, and take any that is.
@@ -166,7 +166,7 @@ def _connection_warnings(config: "OakConfig", connection: str) -> list[str]:
     return warnings
 
 
-def _pipeline(device: Any, config: "OakConfig") -> tuple[Any, dict[str, Any]]:
+def _pipeline(device: dai.Device, config: "OakConfig") -> tuple[dai.Pipeline, dict[str, dai.MessageQueue]]:
     """The pipeline and its queues, which block when they are full: what finds no room is missing in the numbers."""
     pipeline = dai.Pipeline(device)
     # By default depthai may work out a new calibration when a stereo pipeline starts, and write it into the device.
@@ -192,7 +192,7 @@ def _pipeline(device: Any, config: "OakConfig") -> tuple[Any, dict[str, Any]]:
     return pipeline, queues
 
 
-def _encoder(pipeline: Any, output: Any, config: "OakConfig") -> Any:
+def _encoder(pipeline: dai.Pipeline, output: dai.Node.Output, config: "OakConfig") -> dai.node.VideoEncoder:
     encoder = pipeline.create(dai.node.VideoEncoder).build(
         output,
         frameRate=config.fps,
@@ -206,7 +206,7 @@ def _encoder(pipeline: Any, output: Any, config: "OakConfig") -> Any:
     return encoder
 
 
-def _control(control: Any, config: "OakConfig", *, is_color: bool) -> None:
+def _control(control: dai.CameraControl, config: "OakConfig", *, is_color: bool) -> None:
     """Exposure of all cameras alike; focus and white balance of the colour camera, which alone has them."""
     if config.exposure_us is not None and config.iso is not None:
         control.setManualExposure(config.exposure_us, config.iso)
@@ -219,7 +219,7 @@ def _control(control: Any, config: "OakConfig", *, is_color: bool) -> None:
         control.setManualWhiteBalance(config.white_balance_kelvin)
 
 
-def _set_lights(device: Any, config: "OakConfig") -> list[str]:
+def _set_lights(device: dai.Device, config: "OakConfig") -> list[str]:
     warnings = []
     for key, set_intensity, intensity in (
         ("ir_dots", device.setIrLaserDotProjectorIntensity, config.ir_dots),

@@ -38,13 +38,13 @@ def nanoseconds(time: timedelta) -> int:
 class Numbering:
     """What is missing by the numbers that a camera or a sensor gives its messages.
 
-    what: in the plural. A gap counts only if more time than usual has passed too: some firmware numbers the messages of
-    both sensors together.
+    what: in the plural. interval_ns: the usual time from one to the next, 0: not known yet. A gap counts only if more
+    time has passed too: some firmware numbers the messages of both sensors together.
     """
 
     what: str
+    interval_ns: int = 0
     _last: tuple[int, int] | None = None
-    _interval_ns: int = 0
 
     def is_again(self, number: int, ticks: int) -> bool:
         """Whether this is the message that came last, once more."""
@@ -56,11 +56,10 @@ class Numbering:
         if last is None:
             return ()
         lost, interval_ns = number - last[0] - 1, ticks - last[1]
-        if lost > 0 and interval_ns > STEP_FACTOR * self._interval_ns:
-            if self._interval_ns > 0:  # a counter that jumps has not lost more than there was time for
-                lost = min(lost, int(STEP_FACTOR * interval_ns / self._interval_ns))
+        if lost > 0 and 0 < STEP_FACTOR * self.interval_ns < interval_ns:
+            lost = min(lost, int(STEP_FACTOR * interval_ns / self.interval_ns))  # no more than there was time for
             return (DeviceEvent("gap", f"{lost} {self.what} lost before this one", lost),)
-        self._interval_ns = interval_ns
+        self.interval_ns = max(interval_ns, 0)
         return ()
 
 
@@ -76,10 +75,14 @@ class PictureDecoder:
     stream: int
     fps: float
     bad_pictures: int = 0
-    _numbers: Numbering = field(default_factory=lambda: Numbering("pictures"))
+    _numbers: Numbering = field(init=False)
     _wait_for_keyframe: bool = True
     _headers: bytes = b""
     _lens_told: bool = False
+
+    def __post_init__(self) -> None:
+        """The first interval is the one that was asked for."""
+        self._numbers = Numbering("pictures", round(1e9 / self.fps))
 
     def feed(self, arrival_ns: int, message: Message) -> Received:
         """The picture of one message; with the first one a file with what is known of the lens."""
@@ -215,7 +218,8 @@ class ImuDecoder:
             if ticks and not self._gyro.is_again(number, ticks):
                 gyro_events += self._gyro.gap_before(number, ticks)
                 gyro.append((arrival_ns, ImuSample(number, ticks, None, (report.x, report.y, report.z))))
-                self.newest_host_ns = nanoseconds(report.getTimestamp())
+        for report in (packet.acceleroMeter, packet.gyroscope) if message.packets else ():
+            self.newest_host_ns = max(self.newest_host_ns, nanoseconds(report.getTimestamp()))
         return [
             Received(samples=tuple(accel), events=accel_events, stream=self.streams[0]),
             Received(samples=tuple(gyro), events=gyro_events, stream=self.streams[1]),
