@@ -15,13 +15,13 @@ import numpy as np
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 
+from simulated_devices.camera import FULL_RANGE, NEUTRAL_CHROMA
 from simulated_devices.oak_wire import Lens, Request
 from simulated_devices.scene import CameraRenderer, Image, PinholeCamera, Room, stereo_pair
 from simulated_devices.timing import MILLISECOND_NS
 from simulated_devices.world import FloatArray, Trajectory
 
 BITS, BLOCK_PX = 32, 16
-NEUTRAL_CHROMA = 128
 _LOOKAHEAD_NS = 300 * MILLISECOND_NS
 _BEHIND_NS = 300 * MILLISECOND_NS
 _DRAWN = 200
@@ -50,6 +50,7 @@ class OakEncoder:
             context.width, context.height, context.pix_fmt = width, height, "yuv420p"
             context.framerate = Fraction(request.fps).limit_denominator(1001)
             context.time_base = 1 / context.framerate
+            context.color_range = FULL_RANGE
             context.gop_size, context.max_b_frames, context.thread_count = request.keyframe_every, 0, 1
             if request.bitrate_kbps:
                 context.bit_rate = request.bitrate_kbps * 1000
@@ -68,7 +69,7 @@ class OakEncoder:
         if self._encoding == "raw":
             return self._planes.tobytes(), True
         frame = VideoFrame.from_ndarray(self._planes, format="yuv420p")
-        frame.pts = self._number
+        frame.pts, frame.color_range = self._number, FULL_RANGE
         self._number += 1
         (packet,) = self._context.encode(frame)
         return bytes(packet), bool(packet.is_keyframe)

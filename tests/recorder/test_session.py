@@ -602,3 +602,38 @@ def test_skews_of_devices_are_kept_and_taken_up(bench, tmp_path, monkeypatch):
     assert manifest.clocks["imu"].skew_ppm == pytest.approx(42.0, abs=5)
     kept = SkewStore(path).prior("fake 17", time.time())
     assert kept[0] == pytest.approx(manifest.clocks["imu"].skew_ppm, abs=0.01)
+
+
+def test_a_device_of_several_streams_has_each_of_them_in_the_recording(bench, pictures, read_lines):
+    stereo = pictures(4)
+
+    def act():
+        (base_ns, _), *_ = stamps(1, MS)
+        yield Received(events=(DeviceEvent("warning", "USB 2"),), files=(("eeprom.json", b"{}\n"),))
+        yield Received(files=(("eeprom.json", b"another\n"),))
+        for frame in stereo:
+            ticks = base_ns + frame.device_ticks
+            sample = FrameSample(ticks, frame.packet, frame.is_keyframe, frame.video, None)
+            for stream in (0, 1):
+                yield Received(samples=((ticks + DELAY_NS, sample),), stream=stream)
+        for ticks, arrival_ns in stamps(40, 5 * MS):
+            sample = ImuSample(None, ticks, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
+            yield Received(samples=((arrival_ns, sample),), stream=2)
+        yield Received(events=(DeviceEvent("gap", "3 pictures lost", 3),), stream=1)
+
+    driver = bench.add("imu", act)
+    driver.streams = (
+        StreamSpec("frames", 20.0, 1000.0, "left"), StreamSpec("frames", 20.0, 1000.0, "right"),
+        StreamSpec("imu", 200.0, 1000.0, "motion"),
+    )  # fmt: skip
+    folder, manifest = bench.record()
+    assert manifest.cameras == ["imu.left", "imu.right"]
+    written = {name: (device.stream.written, device.stream.lost) for name, device in manifest.devices.items()}
+    assert written == {"imu.left": (4, 0), "imu.right": (4, 3), "imu.motion": (40, 0)}
+    assert {device.clock for device in manifest.devices.values()} == {"imu"}
+    assert {device.identity["serial"] for device in manifest.devices.values()} == {"17"}
+    assert (folder / "raw" / "imu.eeprom.json").read_bytes() == b"{}\n"
+    assert "raw/imu.eeprom.json" in manifest.files
+    told = [(event["device"], event["kind"]) for event in read_lines(folder, "events.jsonl")]
+    assert told == [("imu", "warning"), ("imu", "connected"), ("imu.right", "gap")]
+    assert not [finding for finding in check(folder).findings if finding.severity == "error"]
