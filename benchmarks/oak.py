@@ -8,8 +8,9 @@ device (it reads a socket and makes the messages, as depthai's own threads do fo
 
 passthrough: H.264 of the device, limit 0.15. raw: gray pictures, encoded here, limit 0.5. Both: nothing may be lost,
 all frame sets complete, and the number drawn into each picture must be the one its line is due.
-in-step: messages get lost, pictures come up to half a period late, the device is unplugged again and again; the host's
-time of each exposure is drawn into its picture and must be the time of its line. --smoke: some seconds of each, and ten
+in-step: messages get lost, pictures come up to half a period late, the device is unplugged again and again. The device
+time of each exposure is drawn into its picture: it must be the one that raw/DEVICE.clock has for the picture's line.
+The host's time is drawn too, and tells how good the times of the lines are. --smoke: some seconds of each, and ten
 times the limit.
 """
 
@@ -19,8 +20,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +29,19 @@ import yaml
 
 from drivers.device import driver_type
 from recorder.recording.manifest import Manifest
+from recorder.recording.raw import read_clock_table
 from recorder.rig import parse_rig
 from recorder.session import record
 from recorder.simulation import SimulatedRig
 from simulated_devices.oak_host import THREAD_NAME
-from simulated_devices.oak_pictures import read_number
+from simulated_devices.oak_pictures import STAMP_NS, read_number
 
 LIMITS = {"passthrough": 0.15, "raw": 0.5}
 SMOKE_FACTOR = 10
 LOOP = 60
 FPS = 30
-STAMP_S = 1e-4
 STAMP_WRAP = 1 << 32
-IN_STEP_S = 0.005  # a picture in the place of its neighbour would be off by 0.05 s
+CAMERAS = {"oak.left": "data.mkv", "oak.right": "data2.mkv"}
 
 
 def rig(mode: str) -> dict[str, Any]:
@@ -115,12 +114,15 @@ def frames(folder: Path) -> list[dict[str, Any]]:
         return [line for line in map(json.loads, file) if "frames" in line]
 
 
-def numbers(path: Path) -> Iterator[int]:
-    """The numbers drawn into the pictures of a video."""
+def numbers(path: Path, rows: int = 1) -> np.ndarray:
+    """(n, rows) the numbers drawn into the pictures of a video."""
+    found = []
     with av.open(str(path)) as container:
         container.streams.video[0].thread_type = "NONE"
         for frame in container.decode(video=0):
-            yield read_number(np.asarray(frame.reformat(format="gray").to_ndarray()))
+            picture = frame.to_ndarray(format="gray")
+            found.append([read_number(picture, row) for row in range(rows)])
+    return np.array(found, dtype=np.int64).reshape(-1, rows)
 
 
 def faults_of_loop(folder: Path, manifest: Manifest) -> list[str]:
@@ -133,7 +135,7 @@ def faults_of_loop(folder: Path, manifest: Manifest) -> list[str]:
     if any(entry.get("missingBitmap") for line in lines for entry in line["frames"]):
         faults.append("there are incomplete frame sets")
     times_s = np.array([line["time"] for line in lines])
-    left, right = (np.fromiter(numbers(folder / name), dtype=np.int64) for name in ("data.mkv", "data2.mkv"))
+    left, right = (numbers(folder / name)[:, 0] for name in CAMERAS.values())
     if not len(left) == len(right) == len(lines):
         faults.append(f"{len(lines)} lines, {len(left)} and {len(right)} pictures")
     elif np.any(left != right):
@@ -150,23 +152,37 @@ def faults_of_steps(folder: Path, manifest: Manifest) -> list[str]:
     """What is out of step in a take with losses."""
     faults = []
     lines = frames(folder)
-    counts = Counter()
-    for camera, name in enumerate(("data.mkv", "data2.mkv")):
-        times_s = [line["time"] for line in lines if not line["frames"][camera].get("missingBitmap")]
-        stamps = np.fromiter(numbers(folder / name), dtype=np.int64)
-        if len(times_s) != len(stamps):
-            faults.append(f"{name}: {len(stamps)} pictures, {len(times_s)} lines")
+    stamps_by_line: list[dict[int, int]] = []
+    for camera, (device, name) in enumerate(CAMERAS.items()):
+        own = [index for index, line in enumerate(lines) if not line["frames"][camera].get("missingBitmap")]
+        stamps = numbers(folder / name, rows=2)
+        if len(own) != len(stamps):
+            faults.append(f"{name}: {len(stamps)} pictures, {len(own)} lines")
             continue
-        host = np.round((np.array(times_s) + manifest.start_monotonic_ns * 1e-9) / STAMP_S).astype(np.int64)
-        apart_s = ((host - stamps + STAMP_WRAP // 2) % STAMP_WRAP - STAMP_WRAP // 2) * STAMP_S
-        if np.abs(apart_s).max(initial=0) > IN_STEP_S:
-            faults.append(f"{name}: a picture is {np.abs(apart_s).max() * 1e3:.1f} ms from its line")
-        print(f"  {name}: {len(stamps)} pictures, line minus exposure {apart_s.mean() * 1e3:+.2f} ms on average, "
-              f"from {apart_s.min() * 1e3:+.2f} to {apart_s.max() * 1e3:+.2f} ms")  # fmt: skip
-    for line in lines:
-        counts["complete" if not any(entry.get("missingBitmap") for entry in line["frames"]) else "incomplete"] += 1
+        stamps_by_line.append(dict(zip(own, stamps[:, 0].tolist(), strict=True)))
+        ticks_of: dict[int, set[int]] = {}
+        for ticks, _, line_ns in read_clock_table(folder / "raw" / f"{device}.clock").tolist():
+            ticks_of.setdefault(line_ns, set()).add(ticks // STAMP_NS)
+        times_ns = [round(lines[index]["time"] * 1e9) for index in own]
+        out_of_step = sum(
+            not any(abs(ticks - stamp) <= 1 for ticks in ticks_of.get(time_ns, ()))
+            for time_ns, stamp in zip(times_ns, stamps[:, 0].tolist(), strict=True)
+        )
+        if out_of_step:
+            faults.append(f"{name}: {out_of_step} pictures are not those of their lines")
+        host = (np.array(times_ns) + manifest.start_monotonic_ns) // STAMP_NS
+        apart_ms = ((host - stamps[:, 1] + STAMP_WRAP // 2) % STAMP_WRAP - STAMP_WRAP // 2) * (STAMP_NS * 1e-6)
+        print(f"  {name}: {len(stamps)} pictures, {out_of_step} not of their line; time of the line minus exposure: "
+              f"median {np.median(apart_ms):.1f} ms, 99 % within {np.quantile(np.abs(apart_ms), 0.99):.1f} ms, "
+              f"at most {np.abs(apart_ms).max():.1f} ms")  # fmt: skip
+    left, right = stamps_by_line
+    pairs = sorted(left.keys() & right.keys())
+    unequal = sum(abs(left[index] - right[index]) > 1 for index in pairs)
+    if unequal:
+        faults.append(f"{unequal} pairs are not of one exposure")
     lost = {name: (device.stream.lost, device.stream.dropped) for name, device in manifest.devices.items()}
-    print(f"  frame sets: {dict(counts)}; lost, dropped: {lost}; epochs {manifest.clocks['oak'].epochs}")
+    print(f"  {len(lines)} lines, {len(pairs)} pairs ({unequal} not of one exposure); lost, dropped: {lost}; "
+          f"sync epochs {manifest.clocks['oak'].epochs}")  # fmt: skip
     return faults
 
 

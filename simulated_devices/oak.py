@@ -67,7 +67,7 @@ _FAULTS = frozenset(
 class OakSetup(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Keys of `simulate.oaks.<device>`.
 
-    loop: so many pictures are drawn once and sent again and again. stamped: the host time is drawn into each picture.
+    loop: so many pictures are drawn once and sent again and again. stamped: device and host time are drawn into each.
     picture_jitter_s: each picture comes later by up to so much, for each camera apart.
     pair_skew_s: the right camera exposes so much after the left one.
     """

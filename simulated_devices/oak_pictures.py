@@ -22,6 +22,7 @@ from simulated_devices.timing import MILLISECOND_NS
 from simulated_devices.world import FloatArray, Trajectory
 
 BITS, BLOCK_PX = 32, 16
+STAMP_NS = 100_000
 _LOOKAHEAD_NS = 300 * MILLISECOND_NS
 _BEHIND_NS = 300 * MILLISECOND_NS
 _DRAWN = 200
@@ -75,16 +76,21 @@ class OakEncoder:
         return bytes(packet), bool(packet.is_keyframe)
 
 
-def draw_number(picture: Image, number: int) -> None:
-    """Draw the lowest 32 bits of a number along the upper edge: blocks, black for 0 and white for 1, highest first."""
+def draw_number(picture: Image, number: int, row: int = 0) -> None:
+    """Draw the lowest 32 bits of a number along the upper edge: blocks, black for 0 and white for 1, highest first.
+
+    row: several numbers stand below each other.
+    """
+    rows = slice(row * BLOCK_PX, (row + 1) * BLOCK_PX)
     for bit in range(BITS):
         value = 235 if number >> (BITS - 1 - bit) & 1 else 20
-        picture[:BLOCK_PX, bit * BLOCK_PX : (bit + 1) * BLOCK_PX] = value
+        picture[rows, bit * BLOCK_PX : (bit + 1) * BLOCK_PX] = value
 
 
-def read_number(picture: Image) -> int:
+def read_number(picture: Image, row: int = 0) -> int:
     """The number drawn into a picture (height, width)."""
-    blocks = picture[:BLOCK_PX, : BITS * BLOCK_PX].reshape(BLOCK_PX, BITS, BLOCK_PX)
+    rows = slice(row * BLOCK_PX, (row + 1) * BLOCK_PX)
+    blocks = picture[rows, : BITS * BLOCK_PX].reshape(BLOCK_PX, BITS, BLOCK_PX)
     bits = blocks[4:-4, :, 4:-4].mean(axis=(0, 2)) > 128
     return int("".join("01"[int(bit)] for bit in bits), 2)
 
@@ -115,8 +121,13 @@ class Exposure:
     exposure_ns: int
 
     @property
+    def middle_device_ns(self) -> int:
+        """The middle of it by the device's clock."""
+        return self.end_device_ns - self.exposure_ns // 2
+
+    @property
     def middle_host_ns(self) -> int:
-        """The middle of it."""
+        """The middle of it by the host's clock."""
         return self.end_host_ns - self.exposure_ns // 2
 
 
@@ -148,8 +159,8 @@ class PictureMaker:
     ) -> None:
         """exposure: that of a number; views: what each camera sees at a host time.
 
-        loop: so many pictures are drawn once and sent again and again, numbered; 0: all are drawn. stamped: the host
-        time of the exposure's middle is drawn into each picture, in units of 0.1 ms.
+        loop: so many pictures are drawn once and sent again and again, numbered; 0: all are drawn. stamped: the device
+        time of the exposure's middle is drawn into each picture, and below it the host time, in units of 0.1 ms.
         """
         self.drawn: queue.Queue[Drawn] = queue.Queue(maxsize=_DRAWN)
         self.skipped = 0
@@ -170,7 +181,7 @@ class PictureMaker:
     def _run(self) -> None:
         looped: list[dict[str, tuple[bytes, bool]]] = []
         for index in range(self._loop):
-            looped.append(self._encoded(self._exposure(self._next), index))
+            looped.append(self._encoded(self._exposure(self._next), (index,)))
         first_sent: int | None = None
         while not self._stopped.is_set():
             exposure = self._exposure(self._next)
@@ -186,15 +197,16 @@ class PictureMaker:
             if looped:
                 pictures = looped[(exposure.index - first_sent) % self._loop]
             else:
-                pictures = self._encoded(exposure, exposure.middle_host_ns // 100_000 if self._stamped else None)
+                times_ns = (exposure.middle_device_ns, exposure.middle_host_ns) if self._stamped else ()
+                pictures = self._encoded(exposure, tuple(time_ns // STAMP_NS for time_ns in times_ns))
             for camera, (data, is_keyframe) in pictures.items():
                 self._put(Drawn(camera, exposure, data, is_keyframe))
 
-    def _encoded(self, exposure: Exposure, number: int | None) -> dict[str, tuple[bytes, bool]]:
+    def _encoded(self, exposure: Exposure, numbers: tuple[int, ...]) -> dict[str, tuple[bytes, bool]]:
         pictures = {}
         for camera, picture in self._views(exposure.middle_host_ns).items():
-            if number is not None:
-                draw_number(picture, number)
+            for row, number in enumerate(numbers):
+                draw_number(picture, number, row)
             pictures[camera] = self._encoders[camera].encode(picture)
         return pictures
 

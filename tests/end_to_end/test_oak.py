@@ -6,11 +6,11 @@ import sys
 from pathlib import Path
 
 import av
-import numpy as np
 import pytest
 import yaml
 
-from simulated_devices.oak_pictures import read_number
+from recorder.recording.raw import read_clock_table
+from simulated_devices.oak_pictures import STAMP_NS, read_number
 
 RIG = {
     "simulate": {
@@ -20,8 +20,6 @@ RIG = {
     },
     "devices": {"oak": {"driver": "oak", "fps": 20, "width": 640, "height": 256, "keyframe_every": 5}},
 }
-STAMP_S = 1e-4  # unit of the host's time drawn into each picture
-IN_STEP_S = 0.005  # a tenth of the time between two pictures
 
 
 def rigtape(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -35,31 +33,38 @@ def take(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     out = tmp_path_factory.mktemp(request.param)
     (out / "rig.yaml").write_text(yaml.safe_dump(RIG))
     result = rigtape(
-        "record", str(out / "rig.yaml"), "--simulate", "--duration", "6", "-o", str(out), "--name", "take",
+        "record", str(out / "rig.yaml"), "--simulate", "--duration", "6", "-o", str(out), "--name", "take", "--no-resync",
         "--set", f"devices.oak.encoding={request.param}",
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     return out / "take"
 
 
-def drawn_s(path: Path) -> np.ndarray:
-    """The times drawn into the pictures of a video, in seconds of the host's monotonic clock."""
+def drawn(path: Path) -> list[tuple[int, int]]:
+    """Device and host time drawn into the pictures of a video, in units of STAMP_NS."""
     with av.open(str(path)) as container:
-        numbers = [read_number(frame.to_ndarray(format="gray")) for frame in container.decode(video=0)]
-    return np.array(numbers) * STAMP_S
+        pictures = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+    return [(read_number(picture), read_number(picture, row=1)) for picture in pictures]
 
 
 def test_each_picture_belongs_to_its_line(take: Path) -> None:
-    manifest = json.loads((take / "recording.json").read_text())
+    """The device time drawn into the k-th picture is the one that the clock table has for the k-th line."""
     with (take / "data.jsonl").open() as file:
         lines = [line for line in map(json.loads, file) if "frames" in line]
-    wrap_s = 2**32 * STAMP_S
-    for camera, name in enumerate(("data.mkv", "data2.mkv")):
-        times_s = np.array([line["time"] for line in lines if not line["frames"][camera].get("missingBitmap")])
-        drawn = drawn_s(take / name)
-        assert len(times_s) == len(drawn) > 30
-        apart_s = (times_s + manifest["start_monotonic_ns"] * 1e-9 - drawn + wrap_s / 2) % wrap_s - wrap_s / 2
-        assert np.abs(apart_s).max() < IN_STEP_S
+    by_line: list[dict[int, int]] = []
+    for camera, (device, name) in enumerate((("left", "data.mkv"), ("right", "data2.mkv"))):
+        times_ns = [round(line["time"] * 1e9) for line in lines if not line["frames"][camera].get("missingBitmap")]
+        stamps = [stamp for stamp, _ in drawn(take / name)]
+        assert len(times_ns) == len(stamps) > 30
+        table = {
+            line_ns: ticks for ticks, _, line_ns in read_clock_table(take / "raw" / f"oak.{device}.clock").tolist()
+        }
+        assert max(abs(table[t] // STAMP_NS - stamp) for t, stamp in zip(times_ns, stamps, strict=True)) <= 1
+        by_line.append(dict(zip(times_ns, stamps, strict=True)))
+    left, right = by_line
+    pairs = left.keys() & right.keys()
+    assert len(pairs) > 20
+    assert all(abs(left[time_ns] - right[time_ns]) <= 1 for time_ns in pairs)
 
 
 def test_the_losses_are_counted_and_check_finds_nothing_bad(take: Path) -> None:
