@@ -169,16 +169,27 @@ class Timebase:
                     clock.map.settle()
                     clock.is_new = False
                 waiting, clock.waiting = clock.waiting, []
-                stamped.extend(self._stamp(*sample) for sample in waiting)
+                stamped.extend(self._stamp_all(waiting))
         return stamped
+
+    def _stamp_all(self, waiting: list[tuple[_DeviceStream, int, int, Sample]]) -> list[Stamped]:
+        """Samples that came together and would be stamped after their arrival are moved together: they stay apart."""
+        mapped_ns = [entry.clock.map.host_ns(device_ns) for entry, device_ns, _, _ in waiting]
+        beyond_ns: dict[tuple[str, int], int] = {}
+        for (entry, _, arrival_ns, _), host_ns in zip(waiting, mapped_ns, strict=True):
+            key = (entry.device, arrival_ns)
+            beyond_ns[key] = max(beyond_ns.get(key, 0), host_ns - arrival_ns)
+        return [
+            self._stamp(host_ns - beyond_ns[entry.device, arrival_ns], entry, device_ns, arrival_ns, sample)
+            for (entry, device_ns, arrival_ns, sample), host_ns in zip(waiting, mapped_ns, strict=True)
+        ]
 
     def flush(self) -> list[Stamped]:
         """All samples that are left: the end of a take."""
         self.refit()
         return self.release(max((clock.hold_until_ns for clock in self._clocks.values()), default=0))
 
-    def _stamp(self, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
-        host_ns = min(entry.clock.map.host_ns(device_ns), arrival_ns)
+    def _stamp(self, host_ns: int, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
         point_host_ns = ticks = None
         if isinstance(sample, ScanSample) and len(sample.points):
             point_host_ns, ticks = _point_times(entry, sample.points["timestamp"], arrival_ns)

@@ -183,7 +183,13 @@ class _Reader:
         self._sync = _OwnSync()
 
     def opening(self) -> Received:
-        """What is known of the device before it sends anything."""
+        """What is known of the device before anything is read.
+
+        What has come since it was opened says nothing about its way, having waited here: it is left out.
+        """
+        for queue in self._link.queues.values():
+            if not queue.isClosed():
+                queue.tryGetAll()
         eeprom = json.dumps(self._link.eeprom, indent=1).encode() + b"\n"
         events = tuple(DeviceEvent("warning", text) for text in self._link.warnings)
         return Received(events=events, files=(("eeprom.json", eeprom),))

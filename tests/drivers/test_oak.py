@@ -118,9 +118,10 @@ def config(**keys):
 def read_some(driver, link, feed, *, until):
     """What the driver gives of what `feed` puts into the queues; it is stopped as soon as `until` holds."""
     stop = threading.Event()
-    feed(link.queues)
     items = []
     for item in driver.read(stop):
+        if not items:
+            feed(link.queues)
         items.append(item)
         if until(items):
             stop.set()
@@ -332,10 +333,26 @@ def test_what_waits_is_read_before_the_end(links):
     driver = DRIVER.create("oak", config(imu_rate_hz=0))
     driver.connect()
     stop = threading.Event()
+    reading = driver.read(stop)
+    next(reading)
     stop.set()
     for number in range(30):
         links[0].queues["left"].send(encoded(number, key=number == 0))
-    assert len(samples(driver.read(stop))) == 30
+    assert len(samples(reading)) == 30
+
+
+def test_what_waited_since_the_device_was_opened_is_left_out(links):
+    driver = DRIVER.create("oak", config(imu_rate_hz=0))
+    driver.connect()
+
+    def feed(queues):
+        queues["left"].send(encoded(41, key=True))
+
+    for number in range(40):
+        links[0].queues["left"].send(encoded(number, key=number == 0))
+    items = read_some(driver, links[0], feed, until=lambda items: samples(items))
+    assert len(samples(items)) == 1
+    assert events(items) == []
 
 
 def test_a_lost_device_is_taken_up_again_and_numbered_anew(links):

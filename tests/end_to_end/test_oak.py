@@ -33,8 +33,8 @@ def take(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     out = tmp_path_factory.mktemp(request.param)
     (out / "rig.yaml").write_text(yaml.safe_dump(RIG))
     result = rigtape(
-        "record", str(out / "rig.yaml"), "--simulate", "--duration", "6", "-o", str(out), "--name", "take", "--no-resync",
-        "--set", f"devices.oak.encoding={request.param}",
+        "record", str(out / "rig.yaml"), "--simulate", "--duration", "6", "-o", str(out), "--name", "take",
+        "--no-resync", "--set", f"devices.oak.encoding={request.param}",
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     return out / "take"

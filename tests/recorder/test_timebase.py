@@ -1,5 +1,7 @@
 """The timebase on made-up arrivals: what is held and when it is let go, shared clocks, latency, epochs, scans."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -254,3 +256,20 @@ def test_two_way_pairs_move_the_stamps_by_the_least_delay() -> None:
     late_us = np.array([(s.host_ns - s.device_ns) / 1e3 for s in stamped if s.host_ns > 10**10])
     assert np.abs(late_us).max() < 70
     assert timebase.clocks()["imu"].epoch == 0
+
+
+def test_samples_that_came_together_stay_apart_while_the_clock_is_not_known_well():
+    timebase = Timebase(START_NS, inline_refit=False)  # and the thread that should refit is starved
+    timebase.add_device("imu", clock="imu", tick_hz=1e9, wrap_bits=0, latency_ns=0)
+    stamped: list[Stamped] = []
+    for batch in range(0, 240, 4):
+        delay_ns = max(250 * MS - batch * PERIOD_NS, FLOOR_NS)
+        arrival_ns = truth_ns(batch + 3) + delay_ns
+        for index in range(batch, batch + 4):
+            timebase.take("imu", arrival_ns, imu(index * PERIOD_NS, index))
+        stamped += timebase.release(arrival_ns)
+    stamped += timebase.release(START_NS + 10 * S)
+    times_ns = [entry.host_ns for entry in stamped]
+    assert len(times_ns) == 240
+    assert all(later > earlier for earlier, later in pairwise(times_ns))
+    assert all(entry.host_ns <= entry.arrival_ns for entry in stamped)
