@@ -335,7 +335,7 @@ def _entries(found: Found) -> Iterator[tuple[str, str, dict[str, Any]]]:
     for camera in found.cameras:
         yield "camera", f"{camera.name} ({camera.device})", {"driver": "v4l2", "path": camera.path}
     for oak in found.oak_devices:
-        yield "oak", f"OAK {oak.name}, {oak.state}", {"driver": "oak", "device_id": oak.device_id}
+        yield "oak", f"OAK {oak.name}, {oak.state}", {"driver": "oak", "id": oak.device_id}
     for lidar in found.lidars:
         ports = {key: port for key in ("msop_port", "difop_port") if (port := getattr(lidar, key)) is not None}
         missing = "".join(f", no {kind.upper()} heard" for kind in ("msop", "difop") if f"{kind}_port" not in ports)

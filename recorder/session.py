@@ -231,6 +231,7 @@ class Take:
         self._names = {
             device.name: tuple(stream.name for stream in streams if stream.device is device) for device in rig.devices
         }
+        self._beside = {name: names for names in self._names.values() for name in names}  # streams of its device
         self._devices = {stream.name: _in_take(stream, drivers[stream.device.name], cameras) for stream in streams}
         self._manifest = self._new_manifest(rig, folder.name, streams, cameras)
         self._writer = RecordingWriter(
@@ -386,7 +387,8 @@ class Take:
         left = []
         for name, item in items:
             if _is_connected(item):
-                self._pipeline.reconnected(name)
+                for stream in self._beside[name]:
+                    self._pipeline.reconnected(stream)
             for arrival_ns, sample in item.samples:
                 if until_ns is None or arrival_ns <= until_ns:
                     self._pipeline.take(name, arrival_ns, sample)

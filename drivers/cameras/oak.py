@@ -52,7 +52,7 @@ class OakConfig(DeviceConfig, frozen=True, kw_only=True):
     camera chooses, up to max_exposure_us.
     """
 
-    id: str
+    id: Annotated[str, Meta(min_length=1)]
     backend: str = "depthai"
     fps: Hertz = 30.0
     width: Pixels = 1280

@@ -298,13 +298,12 @@ FOUND = Found(
 def test_the_yaml_is_what_record_takes():
     text = rig_yaml(FOUND)
     rig = parse_rig(text, "printed", Path())
-    assert [device.name for device in rig.devices if device.name != "oak"] == [
-        "imu", "imu2", "gnss", "camera", "lidar", "lidar2",
-    ]  # fmt: skip
+    assert [device.name for device in rig.devices] == ["imu", "imu2", "gnss", "camera", "oak", "lidar", "lidar2"]
     source = rig.source["devices"]
     assert source["imu"] == {"driver": "xsens", "port": "/dev/serial/by-id/a", "baud": 921600}
     assert source["gnss"] == {"driver": "nmea", "port": "/dev/ttyACM0"}
     assert source["camera"]["path"] == "/dev/v4l/by-id/b"
+    assert source["oak"] == {"driver": "oak", "id": "18443010D1"}
     assert source["lidar2"] == {"driver": "robosense", "address": "192.168.1.201", "msop_port": 2369}
     assert "# UDP port 1: busy" in text
     assert "/dev/ttyUSB0, FT232R, USB 0403:6001 serial number A10, latency timer 16 ms: bytes come in bursts" in text
@@ -314,11 +313,12 @@ def test_the_yaml_is_what_record_takes():
 
 def test_what_no_driver_takes_is_a_comment_that_says_why():
     text = rig_yaml(
-        Found(oak_devices=(OakDevice("1", "3.1", "UNBOOTED"),), serial_ports=(SerialPort("/dev/x", "/dev/x", ""),))
+        Found(oak_devices=(OakDevice("", "3.1", "GATE"),), serial_ports=(SerialPort("/dev/x", "/dev/x", ""),))
     )
     assert yaml.safe_load(text) == {"name": "rig", "devices": {}}
     assert "# /dev/x: what speaks on it is not known; --probe listens" in text
-    assert "oak: {driver: oak, device_id: '1'}" in text
+    assert "# OAK 3.1, GATE; this entry: devices.oak.id: Expected `str` of length >= 1" in text
+    assert "# oak: {driver: oak, id: ''}" in text
     assert yaml.safe_load(rig_yaml(Found())) == {"name": "rig", "devices": {}}
     assert "nothing was found" in rig_yaml(Found())
 
