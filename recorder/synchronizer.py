@@ -13,6 +13,7 @@ T = TypeVar("T")
 P = TypeVar("P")
 REMEMBERED_SETS = 256
 ORDER_STEP_NS = 1000
+TOGETHER_NS = 1_000_000  # pictures that one trigger released differ less
 
 
 @dataclass(slots=True)
@@ -66,8 +67,7 @@ class Synchronizer(Generic[T, P]):
         for set_time_ns, frame_set in reversed(self._open_sets):
             if frame_set.group == group and abs(frame_set.device_ns - device_ns) < self.pair_within_ns:
                 if frame_set.pictures[camera] is None:
-                    frame_set.pictures[camera] = picture
-                    return set_time_ns
+                    return self._join(frame_set, set_time_ns, camera, device_ns, time_ns, picture)
                 break  # a second picture of one camera within half a period: kept as a set of its own
         frame_set = FrameSet(device_ns, [None] * self.cameras, group)
         frame_set.pictures[camera] = picture
@@ -79,6 +79,26 @@ class Synchronizer(Generic[T, P]):
             time_ns = self._between_neighbours(group, device_ns, time_ns)
         self._open_sets.append((time_ns, frame_set))
         self._push(time_ns, frame_set)
+        return time_ns
+
+    def _join(
+        self, joined: FrameSet[P], set_time_ns: int, camera: int, device_ns: int, time_ns: int, picture: P | None
+    ) -> int:
+        """Put a picture into a set that waits; gives the set's time.
+
+        Where cameras are not triggered together, it is the time of the first of them that counts, as for clients.
+        """
+        is_first = all(other is None for other in joined.pictures[:camera])
+        joined.pictures[camera] = picture
+        if picture is None or not is_first or abs(joined.device_ns - device_ns) < TOGETHER_NS:
+            return set_time_ns
+        self._open_sets = deque(entry for entry in self._open_sets if entry[1] is not joined)
+        self._heap = [entry for entry in self._heap if entry[2] is not joined]
+        heapq.heapify(self._heap)
+        time_ns = self._between_neighbours(joined.group, device_ns, time_ns)
+        joined.device_ns = device_ns
+        self._open_sets.append((time_ns, joined))
+        self._push(time_ns, joined)
         return time_ns
 
     def _between_neighbours(self, group: int, device_ns: int, time_ns: int) -> int:

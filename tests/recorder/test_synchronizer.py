@@ -281,3 +281,18 @@ def test_a_partner_is_remembered_for_seconds(late_by):
     synchronizer.release(10**12)
     synchronizer.add_picture(1, 0, 3, "right")
     assert shown(synchronizer.flush()) == [(7, (None, "right"), True)]
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0), (2, 0, 1)])
+def test_a_set_has_the_time_of_its_first_camera_where_others_expose_apart(order):
+    apart = {0: 0, 1: 3_000, 2: -12 * MS}  # a pair on one trigger, and a camera of its own rhythm
+    synchronizer = made(cameras=3)
+    synchronizer.add(PERIOD - 5 * MS, "between")
+    for index in range(1, 4):
+        for camera in order:
+            time_ns = index * PERIOD + apart[camera]
+            synchronizer.add_picture(camera, time_ns, time_ns, f"{camera}.{index}")
+    frames = [entry for entry in synchronizer.flush() if isinstance(entry.item, FrameSet)]
+    assert [entry.item.pictures for entry in frames] == [[f"{camera}.{i}" for camera in range(3)] for i in (1, 2, 3)]
+    assert all(abs(entry.time_ns - index * PERIOD) <= 3_000 for index, entry in enumerate(frames, 1))
+    assert not any(entry.late for entry in frames)
