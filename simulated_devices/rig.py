@@ -35,7 +35,7 @@ from simulated_devices.faults import NO_FAULTS, FaultSettings
 from simulated_devices.imu import ImuSimulator
 from simulated_devices.microstrain import MicrostrainSettings, microstrain_simulator
 from simulated_devices.nmea import NmeaSettings, NmeaSimulator
-from simulated_devices.oak import NO_SETUP, OakSettings, OakSetup, OakSimulator, imu_camera
+from simulated_devices.oak import IMU_FROM_RIG, NO_SETUP, OakSettings, OakSetup, OakSimulator, imu_camera
 from simulated_devices.oak_pictures import rig_cameras
 from simulated_devices.pose import PoseSettings, PoseSimulator
 from simulated_devices.robosense import LidarSettings, RobosenseSettings, RobosenseSimulator
@@ -311,9 +311,7 @@ class Cast:
             raise ValueError(f"simulate.faults.{name}: a simulated camera has no faults")
         if len(self.cameras) >= 2:
             raise ValueError(f"devices.{name}: a simulated rig has at most two cameras")
-        for key in ("width", "height"):
-            if getattr(settings, key) % 2 or not 32 <= getattr(settings, key) <= 4096:
-                raise ValueError(f"devices.{name}.{key}: must be even, from 32 to 4096")
+        _check_sizes(name, settings, ("width", "height"))
         pair = stereo_pair(settings.width, settings.height)
         if self._lens != "pinhole":
             pair = board_cameras(self._lens, settings.width, settings.height)
@@ -323,6 +321,11 @@ class Cast:
 
     def _oak(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, OakSettings, f"devices.{name}")
+        _check_sizes(name, settings, ("width", "height", "color_width", "color_height"))
+        if not 0 < settings.fps <= 240:
+            raise ValueError(f"devices.{name}.fps: {settings.fps} is not above 0 and up to 240")
+        if settings.imu_variant not in IMU_FROM_RIG:
+            raise ValueError(f"devices.{name}.imu_variant: must be one of {', '.join(IMU_FROM_RIG)}")
         cameras = rig_cameras(settings)
         if cameras and self.cameras:
             raise ValueError(f"devices.{name}: a simulated rig has one stereo pair, and there is another one")
@@ -505,6 +508,12 @@ def _convert(entry: Mapping[str, Any], settings: type[Settings], where: str) -> 
     except msgspec.ValidationError as error:
         message, _, place = str(error).partition(" - at `$")
         raise ConfigError(f"{where}{place.rstrip('`')}: {message}") from error
+
+
+def _check_sizes(name: str, settings: msgspec.Struct, keys: tuple[str, ...]) -> None:
+    for key in keys:
+        if getattr(settings, key) % 2 or not 32 <= getattr(settings, key) <= 4096:
+            raise ValueError(f"devices.{name}.{key}: must be even, from 32 to 4096")
 
 
 def _baud_checked(name: str, settings: Settings) -> Settings:

@@ -187,24 +187,18 @@ class _Reader:
 
         What has come since it was opened says nothing about its way, having waited here: it is left out.
         """
-        for queue in self._link.queues.values():
-            if not queue.isClosed():
-                queue.tryGetAll()
+        for name in self._link.queues:
+            self._waiting(name)
         eeprom = json.dumps(self._link.eeprom, indent=1).encode() + b"\n"
         events = tuple(DeviceEvent("warning", text) for text in self._link.warnings)
         return Received(events=events, files=(("eeprom.json", eeprom),))
 
     def next(self) -> Iterator[Received]:
         """All that has come, waiting a little if there is nothing."""
-        queues = self._link.queues
-        dai.MessageQueue.waitAny(list(queues.values()), WAIT)
+        dai.MessageQueue.waitAny(list(self._link.queues.values()), WAIT)
         arrival_ns = time.monotonic_ns()
-        for name, queue in queues.items():
-            try:
-                messages = queue.tryGetAll()
-            except dai.MessageQueue.QueueException as error:
-                raise DeviceError(f"OAK {self._config.id}: the connection is lost ({name}: {error})") from error
-            for message in messages:
+        for name in self._link.queues:
+            for message in self._waiting(name):
                 self._heard_s[name] = arrival_ns * 1e-9
                 if name == "imu":
                     yield from self._imu.feed(arrival_ns, message)
@@ -214,6 +208,14 @@ class _Reader:
             yield from self._sync.judge(arrival_ns, self._imu.newest_host_ns, self._config.latency_s)
             self._imu.newest_host_ns = 0
         yield from self._watch(arrival_ns * 1e-9)
+
+    def _waiting(self, name: str) -> list[Any]:
+        """What waits in a queue; there is nothing left in one that was closed."""
+        try:
+            messages: list[Any] = self._link.queues[name].tryGetAll()
+        except (dai.MessageQueue.QueueException, RuntimeError) as error:
+            raise DeviceError(f"OAK {self._config.id}: the connection is lost ({name}: {error})") from error
+        return messages
 
     def _watch(self, now_s: float) -> Iterator[Received]:
         """Give a silent device up; tell of a stream that is silent while others are not."""

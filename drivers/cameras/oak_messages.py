@@ -90,6 +90,8 @@ class PictureDecoder:
             return self._bad(arrival_ns, f"{type(message).__name__} is no picture", None)
         meta = message if isinstance(message, RAW_PICTURE) else message.getImgFrameMeta()
         ticks = nanoseconds(meta.getTimestampDevice(MIDDLE))
+        if self._numbers.is_again(message.getSequenceNum(), ticks):
+            return Received(stream=self.stream)
         events = self._numbers.gap_before(message.getSequenceNum(), ticks)
         sample, fault = self._sample(message, ticks, bool(events))
         if fault:

@@ -245,7 +245,7 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
     [
         (
             "simulate.colour=1",
-            ["simulate.colour", "allowed: board, faults, jitter, lens, lidars, scene, seed, skew_ppm, trajectory"],
+            ["simulate.colour", "allowed: board, faults, jitter, lens, lidars, oaks, rig, scene, seed, skew_ppm, trajectory"],
         ),
         ("simulate.seed=-1", ["simulate.seed"]),
         ("simulate.lidars.radar={}", ["simulate.lidars.radar", "lidar"]),
@@ -253,10 +253,10 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
         ("devices.lidar.model=m9", ["devices.lidar.model", "m9"]),
         ("simulate.trajectory=slow", ["simulate.trajectory", "brisk, gentle"]),
         (
-            "devices.imu.driver=oak",
+            "devices.imu.driver=sonar",
             [
                 "devices.imu.driver",
-                "ascii-imu, bno08x-rvc, microstrain, nmea, pose, robosense, robosense-imu, stream, vectornav, "
+                "ascii-imu, bno08x-rvc, microstrain, nmea, oak, pose, robosense, robosense-imu, stream, vectornav, "
                 "witmotion, xsens",
             ],
         ),
@@ -266,6 +266,16 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
         ("devices.mocap.port=70000", ["devices.mocap.port", "65535"]),
         ("devices.a/b={driver: nmea}", ["devices.a/b", "letter"]),
         ("devices={}", ["devices"]),
+        ("simulate.rig=boat", ["simulate.rig", "'boat'", "rig, oak"]),
+        ("devices.oak={driver: oak}", ["devices.oak", "another one"]),
+        ("devices.oak={driver: oak, fps: fast, stereo: false}", ["devices.oak.fps", "float"]),
+        ("devices={oak: {driver: oak, width: 33}}", ["devices.oak.width", "even"]),
+        ("devices={oak: {driver: oak, fps: 0}}", ["devices.oak.fps", "240"]),
+        (
+            "devices={oak: {driver: oak, imu_variant: fast}}",
+            ["devices.oak.imu_variant", "uncalibrated, calibrated, raw"],
+        ),
+        ("simulate.oaks.imu.loop=-1", ["simulate.oaks", "imu", "loop"]),
     ],
 )
 def test_wrong_use_names_the_key_and_what_is_allowed(setting, words):
@@ -279,7 +289,7 @@ def test_wrong_use_is_one_line_and_exit_code_2():
     command = [sys.executable, "-m", "simulated_devices", "--set", "simulate.colour=1"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S)
     assert (ended.returncode, ended.stdout) == (2, "")
-    allowed = "board, faults, jitter, lens, lidars, scene, seed, skew_ppm, trajectory"
+    allowed = "board, faults, jitter, lens, lidars, oaks, rig, scene, seed, skew_ppm, trajectory"
     assert ended.stderr == f"simulate.colour: unknown key; allowed: {allowed}\n"
 
 
