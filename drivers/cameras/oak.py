@@ -49,7 +49,7 @@ class OakConfig(DeviceConfig, frozen=True, kw_only=True):
 
     id: its id, its IP address (PoE) or its USB port. raw pictures are encoded by the recorder.
     bitrate_kbps 0: the encoder's own choice. imu_rate_hz 0: no IMU. Exposure and iso go together; without them the
-    camera chooses, up to max_exposure_us.
+    camera chooses, up to max_exposure_us. trigger left: that camera's sync pin drives the others (FFC boards).
     """
 
     id: Annotated[str, Meta(min_length=1)]
@@ -71,6 +71,7 @@ class OakConfig(DeviceConfig, frozen=True, kw_only=True):
     exposure_us: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
     iso: Annotated[int, Meta(ge=50, le=6400)] | None = None
     max_exposure_us: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
+    trigger: Literal["auto", "left"] = "auto"
     focus: Annotated[int, Meta(ge=0, le=255)] | None = None
     white_balance_kelvin: Annotated[int, Meta(ge=1000, le=12000)] | None = None
     ir_dots: Share = 0.0

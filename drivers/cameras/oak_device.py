@@ -175,6 +175,9 @@ def _pipeline(device: dai.Device, config: "OakConfig") -> tuple[dai.Pipeline, di
     for name, size in config.videos.items():
         camera = pipeline.create(dai.node.Camera).build(SOCKETS[name], sensorFps=config.fps)
         _control(camera.initialControl, config, is_color=name == "color")
+        if config.trigger == "left":
+            modes = dai.CameraControl.FrameSyncMode
+            camera.initialControl.setFrameSyncMode(modes.OUTPUT if name == "left" else modes.INPUT)
         pixels = dai.ImgFrame.Type.NV12 if name == "color" else dai.ImgFrame.Type.GRAY8
         output = camera.requestOutput(
             size, type=pixels, resizeMode=dai.ImgResizeMode.CROP, fps=config.fps, enableUndistortion=False

@@ -137,6 +137,7 @@ class PictureDecoder:
         self._lens_told = True
         width, height = transformation.getSize()
         lens = {
+            "socket": dai.CameraBoardSocket(message.getInstanceNum()).name,
             "imageWidth": width,
             "imageHeight": height,
             "intrinsicMatrix": transformation.getIntrinsicMatrix(),

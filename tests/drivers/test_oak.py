@@ -267,10 +267,11 @@ def test_the_lens_is_kept_once():
     decoder = PictureDecoder("left", 0, 30.0)
     message = encoded(0, key=True)
     message.setTransformation(transformation)
+    message.setInstanceNum(1)
     ((name, data),) = decoder.feed(0, message).files
     assert name == "left.lens.json"
     lens = json.loads(data)
-    assert (lens["imageWidth"], lens["imageHeight"]) == (1280, 800)
+    assert (lens["socket"], lens["imageWidth"], lens["imageHeight"]) == ("CAM_B", 1280, 800)
     assert lens["intrinsicMatrix"][1][1] == 801
     assert decoder.feed(0, message).files == ()
 

@@ -252,6 +252,12 @@ def test_exposure_of_both_cameras(fake_depthai, calls, keys, call, arguments):
     assert arguments_of(calls, call) == [(arguments, {})] * 2
 
 
+def test_the_left_camera_can_drive_the_others(fake_depthai, calls):
+    oak_device.open_device(config(trigger="left", color=True))
+    modes = [arguments[0].name for arguments, _ in arguments_of(calls, "CameraControl.setFrameSyncMode")]
+    assert modes == ["OUTPUT", "INPUT", "INPUT"]
+
+
 @pytest.mark.parametrize("variant", ["uncalibrated", "calibrated", "raw"])
 def test_the_imu_variant_is_asked_for_and_told(fake_depthai, calls, variant):
     device = oak_device.open_device(config(imu_variant=variant, imu_rate_hz=200, imu_batch=2))
