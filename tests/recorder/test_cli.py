@@ -228,10 +228,8 @@ def test_wrong_setting_of_the_simulation(tmp_path: Path) -> None:
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=30)
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
-    assert (
-        "simulate.speed: unknown key; allowed: board, faults, jitter, lens, lidars, scene, seed, skew_ppm, trajectory"
-        in line
-    )
+    allowed = "board, faults, jitter, lens, lidars, oaks, rig, scene, seed, skew_ppm, trajectory"
+    assert f"simulate.speed: unknown key; allowed: {allowed}" in line
     assert not (tmp_path / "out").exists()
 
 
