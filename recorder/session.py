@@ -156,17 +156,24 @@ def _too_few(calibration: Calibration, cameras: list[_Stream]) -> list[str]:
     return [f"has {len(calibration.cameras)} cameras, the rig has {len(cameras)} ({names})"]
 
 
-def _other_size(calibration: Calibration, cameras: list[RigDevice]) -> list[str]:
+def _other_size(calibration: Calibration, cameras: list[_Stream]) -> list[str]:
     """Cameras whose pictures are set to another size than the calibration is for."""
     faults = []
-    for index, (lens, device) in enumerate(zip(calibration.cameras, cameras, strict=False)):
-        size = (getattr(device.config, "width", None), getattr(device.config, "height", None))
+    for index, (lens, camera) in enumerate(zip(calibration.cameras, cameras, strict=False)):
+        size = (_side(camera, "width"), _side(camera, "height"))
         expected = (lens.image_width_px, lens.image_height_px)
         if None not in size and size != expected:
             faults.append(
-                f"camera {index} is for {expected[0]}x{expected[1]} pictures, {device.name} sends {size[0]}x{size[1]}"
+                f"camera {index} is for {expected[0]}x{expected[1]} pictures, {camera.name} sends {size[0]}x{size[1]}"
             )
     return faults
+
+
+def _side(camera: _Stream, side: str) -> int | None:
+    """What is configured for pictures of a camera, by a key for this one or for all of the device; None: nothing."""
+    config = camera.device.config
+    found: int | None = getattr(config, f"{camera.spec.name}_{side}", getattr(config, side, None))
+    return found
 
 
 def _connect(rig: Rig, drivers: dict[str, Driver], stop: threading.Event, on_event: OnEvent) -> set[str]:

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from simulated_devices.board_scene import BoardWall
 from simulated_devices.faults import NO_FAULTS, FaultSettings, Hits, Schedule
 from simulated_devices.oak_pictures import Drawn, Exposure, PictureMaker, lens, rig_cameras, views_of
 from simulated_devices.oak_wire import Imu, Lens, Opened, Picture, Reading, Request, encoded, receive
@@ -104,7 +105,7 @@ class OakSimulator:
         settings: OakSettings,
         stage: Stage,
         trajectory: Trajectory,
-        room: Room,
+        scene: Room | BoardWall,
         faults: FaultSettings = NO_FAULTS,
         setup: OakSetup = NO_SETUP,
     ) -> None:
@@ -114,7 +115,7 @@ class OakSimulator:
         self.name = name
         self.opened = OpenedFlag()
         self.pacer = Pacer()
-        self._stage, self._trajectory, self._room = stage, trajectory, room
+        self._stage, self._trajectory, self._scene = stage, trajectory, scene
         self._faults, self._setup = faults, setup
         self._schedule = Schedule(faults, lambda: stage.start_ns)
         self._clock = stage.clock(settings.clock or name)
@@ -205,7 +206,7 @@ class OakSimulator:
         """Begins to draw pictures."""
         views = views_of(
             cameras,
-            self._room,
+            self._scene,
             self._trajectory,
             lambda host_ns: float(self._stage.world_s(np.array([host_ns]))[0]),
             lambda camera: self._stage.seed_for("camera", self.name, camera),

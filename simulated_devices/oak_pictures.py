@@ -15,9 +15,10 @@ import numpy as np
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 
+from simulated_devices.board_scene import BoardWall, renderer
 from simulated_devices.camera import FULL_RANGE, NEUTRAL_CHROMA
 from simulated_devices.oak_wire import Lens, Request
-from simulated_devices.scene import CameraRenderer, Image, PinholeCamera, Room, stereo_pair
+from simulated_devices.scene import Image, PinholeCamera, Room, stereo_pair
 from simulated_devices.timing import MILLISECOND_NS
 from simulated_devices.world import FloatArray, Trajectory
 
@@ -220,16 +221,16 @@ class PictureMaker:
 
 def views_of(
     cameras: dict[str, PinholeCamera],
-    room: Room,
+    scene: Room | BoardWall,
     trajectory: Trajectory,
     world_s: Callable[[int], float],
     seed: Callable[[str], int],
 ) -> Callable[[int], dict[str, Image]]:
     """What each camera sees at a host time."""
-    renderers = {name: CameraRenderer(room, camera, seed=seed(name)) for name, camera in cameras.items()}
+    renderers = {name: renderer(scene, camera, seed(name)) for name, camera in cameras.items()}
 
     def views(host_ns: int) -> dict[str, Image]:
         rotation, position_m = trajectory.pose(np.array([world_s(host_ns)]))
-        return {name: renderer.render(rotation[0], position_m[0]) for name, renderer in renderers.items()}
+        return {name: each.render(rotation[0], position_m[0]) for name, each in renderers.items()}
 
     return views

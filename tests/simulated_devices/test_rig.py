@@ -245,7 +245,10 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
     [
         (
             "simulate.colour=1",
-            ["simulate.colour", "allowed: board, faults, jitter, lens, lidars, oaks, rig, scene, seed, skew_ppm, trajectory"],
+            [
+                "simulate.colour",
+                "allowed: board, faults, jitter, lens, lidars, oaks, rig, scene, seed, skew_ppm, trajectory",
+            ],
         ),
         ("simulate.seed=-1", ["simulate.seed"]),
         ("simulate.lidars.radar={}", ["simulate.lidars.radar", "lidar"]),
