@@ -103,8 +103,11 @@ def _note_quality(recording: Recording, report: Report) -> None:
     if recording.manifest is not None:
         if recording.manifest.state == "recording":
             report.note("the recording was not finished (or is still running): `rigtape recover` saves all of it")
-        imus = [name for name, device in recording.manifest.devices.items() if device.stream.kind == "imu"]
-        if len(imus) > 1:
+        imus = {
+            name: device.stream for name, device in recording.manifest.devices.items() if device.stream.kind == "imu"
+        }
+        sensors = [sensor for imu in imus.values() for sensor, count in imu.sensor_lines.items() if count]
+        if len(imus) > 1 and (not sensors or len(sensors) > len(set(sensors))):  # else each has sensors of its own
             report.note(
                 f"the samples of {len(imus)} IMUs ({', '.join(imus)}) are mixed: lines do not say whose they are"
             )

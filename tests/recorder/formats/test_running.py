@@ -1,6 +1,7 @@
 """Exports and imports appear whole or not at all, and say what they left out."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from importlib.metadata import EntryPoint
@@ -111,6 +112,22 @@ def test_an_export_says_what_it_left_out(known: Path, tmp_path: Path) -> None:
         (5, "too far north"),
         (15, "has no place there"),
     ]
+
+
+@pytest.mark.parametrize(("second", "is_mixed"), [("accelerometer", False), ("gyroscope", True)])
+def test_imus_are_told_to_be_mixed_where_they_share_a_sensor(
+    known: Path, tmp_path: Path, second: str, is_mixed: bool
+) -> None:
+    folder = tmp_path / "rec"
+    shutil.copytree(known, folder)
+    manifest = json.loads((folder / "recording.json").read_text())
+    ((name, imu),) = [item for item in manifest["devices"].items() if item[1]["stream"]["kind"] == "imu"]
+    other = json.loads(json.dumps(imu))
+    imu["stream"]["sensor_lines"], other["stream"]["sensor_lines"] = {"gyroscope": 400}, {second: 400}
+    manifest["devices"]["other"] = other
+    (folder / "recording.json").write_text(json.dumps(manifest))
+    notes = " ".join(export(folder, tmp_path / "out", "numbers").notes)
+    assert (f"the samples of 2 IMUs ({name}, other) are mixed" in notes) == is_mixed
 
 
 def test_start_and_end_cut(known: Path, tmp_path: Path) -> None:
