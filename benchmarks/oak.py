@@ -132,19 +132,23 @@ def faults_of_loop(folder: Path, manifest: Manifest, fps: int) -> list[str]:
         if device.stream.lost or device.stream.dropped or not device.stream.written:
             faults.append(f"{name}: {device.stream}")
     lines = frames(folder)
-    if any(entry.get("missingBitmap") for line in lines for entry in line["frames"]):
+    drawn: list[dict[int, int]] = []  # numbers in the pictures, by line
+    for camera, name in enumerate(CAMERAS.values()):
+        own = [index for index, line in enumerate(lines) if not line["frames"][camera].get("missingBitmap")]
+        pictures = numbers(folder / name)[:, 0].tolist()
+        if len(own) != len(pictures):
+            faults.append(f"{name}: {len(pictures)} pictures, {len(own)} lines")
+        drawn.append(dict(zip(own, pictures, strict=False)))
+    whole = sorted(drawn[0].keys() & drawn[1].keys())
+    # The take may begin or end between the two pictures of a set.
+    if whole != list(range(whole[0], whole[-1] + 1)) or whole[0] > 1 or whole[-1] < len(lines) - 2:
         faults.append("there are incomplete frame sets")
-    times_s = np.array([line["time"] for line in lines])
-    left, right = (numbers(folder / name)[:, 0] for name in CAMERAS.values())
-    if not len(left) == len(right) == len(lines):
-        faults.append(f"{len(lines)} lines, {len(left)} and {len(right)} pictures")
-    elif np.any(left != right):
+    if any(drawn[0][index] != drawn[1][index] for index in whole):
         faults.append("pairs are not of one exposure")
-    else:
-        steps = np.rint(np.diff(times_s) * fps).astype(np.int64)
-        if np.any(steps != 1) or np.any(np.diff(left) % LOOP != 1):
-            faults.append("numbers of pictures and times of lines do not go together")
-    print(f"  {len(lines)} lines, {len(left)} + {len(right)} pictures, all pairs of one exposure: {not faults}")
+    steps = np.rint(np.diff([lines[index]["time"] for index in whole]) * fps)
+    if np.any(steps != 1) or np.any(np.diff([drawn[0][index] for index in whole]) % LOOP != 1):
+        faults.append("numbers of pictures and times of lines do not go together")
+    print(f"  {len(lines)} lines, {len(whole)} pairs, all of one exposure and in step: {not faults}")
     return faults
 
 
