@@ -412,7 +412,8 @@ class Simulation:
             opened = [bool(device.opened) for device in self._devices if device.opened is not None]
             if any(opened) and first_opened_ns is None:
                 first_opened_ns = time.monotonic_ns()
-            waited_ns = time.monotonic_ns() - (first_opened_ns or time.monotonic_ns()) - self._settle_ns
+            now_ns = time.monotonic_ns()
+            waited_ns = now_ns - (first_opened_ns or now_ns) - self._settle_ns
             if waited_ns >= 0 and (all(opened) or waited_ns > OPENING_NS):
                 self._stage.start()
 

@@ -14,6 +14,7 @@ from drivers.samples import FixSample, FrameSample, ImuSample, PoseSample
 from recorder.errors import StorageError
 from recorder.formats import FormatError, PictureSet, Source, Stream
 from recorder.formats.report import Report
+from recorder.recording.check_data import path_inside
 from recorder.recording.manifest import DeviceSummary, StreamSummary, write_atomically
 from recorder.recording.pictures import LosslessEncoder
 from recorder.recording.writer import RecordingWriter, new_manifest
@@ -39,7 +40,7 @@ def write_source(
         raise FormatError(f"{origin['source']}: there are no samples in it")
     out.mkdir()
     for name, data in sorted(source.files.items()):
-        _keep(out / FILES_FOLDER / name, data)
+        _keep(out / FILES_FOLDER, name, data)
     writing = _Writing(source, out, first[0], origin)
     try:
         writing.take(first)
@@ -57,7 +58,8 @@ def write_source(
         report.leave_out("gps", writing.unusable, "without altitude or accuracy")
 
 
-def _keep(path: Path, data: bytes | Path) -> None:
+def _keep(folder: Path, name: str, data: bytes | Path) -> None:
+    path = path_inside(folder, name) or folder / Path(name).name
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(data, Path):
         shutil.copyfile(data, path)

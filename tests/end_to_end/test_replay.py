@@ -34,9 +34,12 @@ def recorded_again(take: Path, folder: Path) -> Recording:
 
 def shift_ns(before: Any, after: Any, values: str) -> int:
     """All rows of `before` are in `after`, in order; gives by how much their times differ, and that it is always so."""
-    rows = [row.tobytes() for row in getattr(after, values)]
-    begin = rows.index(getattr(before, values)[0].tobytes())
-    assert rows[begin : begin + len(before)] == [row.tobytes() for row in getattr(before, values)]
+    wanted, rows = getattr(before, values), getattr(after, values)
+    begin = next(
+        begin
+        for begin in range(len(rows) - len(wanted) + 1)
+        if np.array_equal(rows[begin : begin + len(wanted)], wanted)
+    )
     shifts = after.time_ns[begin : begin + len(before)] - before.time_ns
     assert np.ptp(shifts) < 2 * MOST_LATE_NS
     return int(np.median(shifts))
