@@ -183,10 +183,10 @@ class Playbill:
                 self.left_out.append(f"{name}: has no pictures")
                 continue
             summary = manifest.devices.get(name) if manifest else None
-            keys: dict[str, Any] = {}
+            keys: dict[str, Any] = {"clock": "cameras"}
             if manifest and summary and summary.driver == "stream":
-                keys = _rig_keys(manifest.rig.get("devices", {}).get(name), summary)
-            keys |= {"driver": "stream", "clock": summary.clock if summary else "cameras", "required": False}
+                keys = _rig_keys(manifest.rig.get("devices", {}).get(name), summary) | {"clock": summary.clock}
+            keys |= {"driver": "stream", "required": False}
             keys.setdefault("fps", round(_rate_hz(shown), 3))
             ticks, arrival_ns = self._picture_times(name, shown.time_ns)
             script = functools.partial(self._picture_script, video, shown.picture[:, camera], ticks, arrival_ns)
@@ -253,6 +253,7 @@ class Playbill:
         return SerialReplay(name, self._performance, script)
 
     def _imu_script(self, time_ns: Int64Array, values: np.ndarray[Any, np.dtype[np.float64]]) -> Script:
+        yield self._due(int(time_ns[0])), b"\n"  # who begins to listen takes the first line for a part of one
         for at_ns, row in zip(time_ns.tolist(), values.tolist(), strict=True):
             text = " ".join(map(repr, row))
             yield self._due(at_ns), f"{at_ns // SECOND_NS}.{at_ns % SECOND_NS:09d} {text}\n".encode()

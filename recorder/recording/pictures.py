@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from av.container import InputContainer
 from av.video.codeccontext import VideoCodecContext
-from av.video.frame import VideoFrame
+from av.video.frame import PictureType, VideoFrame
 from av.video.stream import VideoStream
 
 from drivers.samples import FrameSample, VideoFormat
@@ -200,16 +200,22 @@ class LosslessEncoder:
             "tune": "zerolatency",
             "qp": "0",
             "g": str(KEYFRAME_EVERY),
+            "forced-idr": "1",
             "x264-params": "repeat-headers=1:annexb=1:log-level=error",
         }
         self._context = context
         self._count = 0
+        self._longest_step_ns = 1.5e9 / fps
+        self._last_ns: int | None = None
 
     def encode(self, picture: Image, time_ns: int, exposure_s: float | None) -> FrameSample:
-        """One picture of that size and kind."""
+        """One picture of that size and kind; behind a gap a key frame, so that what is sent on can be joined there."""
         frame = VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=self._format)
         frame.color_range = FULL_RANGE
         frame.pts = self._count
+        if self._last_ns is not None and time_ns - self._last_ns > self._longest_step_ns:
+            frame.pict_type = PictureType.I
+        self._last_ns = time_ns
         self._count += 1
         (packet,) = self._context.encode(frame)
         return FrameSample(time_ns, bytes(packet), packet.is_keyframe, self.video, exposure_s)
