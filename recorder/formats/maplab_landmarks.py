@@ -22,7 +22,7 @@ MAX_ERROR_PX = 2.0
 HUBER_PX = 0.7
 MIN_VIEWS = 3
 MIN_PARALLAX_DEG = 1.5
-MAX_SIGMA_SHARE = 0.02  # of the distance
+MAX_SIGMA_SHARE = 0.015  # of the distance
 STEPS = 8
 DIFFERENCE = 1e-6
 
@@ -30,7 +30,7 @@ FEW, PARALLAX, ERROR, SIGMA = (
     f"seen at fewer than {MIN_VIEWS} vertices",
     f"parallax below {MIN_PARALLAX_DEG:g} deg",
     f"reprojected more than {MAX_ERROR_PX:g} px off",
-    f"expected error above {MAX_SIGMA_SHARE:.0%} of the distance",
+    f"expected error above {MAX_SIGMA_SHARE:.1%} of the distance",
 )
 
 
