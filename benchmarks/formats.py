@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-FORMATS = ("euroc", "rosbag1", "rosbag2", "mcap", "ply", "pcd", "tum", "kitti")
+FORMATS = ("euroc", "rosbag1", "rosbag2", "mcap", "ply", "pcd", "tum", "kitti", "maplab")
 FULL = {"imu.rate_hz": 1000} | {
     f"{camera}.{key}": value
     for camera in ("left", "right")

@@ -282,7 +282,7 @@ def _lenses(recording: Recording, report: Report) -> dict[int, Camera]:
     known = recording.calibration.cameras if recording.calibration else []
     lenses = {}
     for index, (name, camera) in enumerate(zip(frames.cameras, known, strict=False)):
-        faults = validate(Calibration(cameras=[camera]))
+        faults = validate(Calibration(cameras=[camera])) or _size_faults(frames, index, camera)
         if faults:
             report.note(f"camera {name}: no landmarks, its calibration cannot be used: {faults[0]}")
             continue
@@ -293,6 +293,15 @@ def _lenses(recording: Recording, report: Report) -> dict[int, Camera]:
         else:
             lenses[index] = camera
     return lenses
+
+
+def _size_faults(frames: Frames, index: int, camera: Camera) -> list[str]:
+    with_picture = np.flatnonzero(frames.picture[:, index] >= 0)
+    image = frames.image(int(with_picture[0]), index) if len(with_picture) else None
+    known = (camera.image_height_px, camera.image_width_px)
+    if image is None or image.shape == known:
+        return []
+    return [f"it is of {known[1]}x{known[0]} pictures, these are {image.shape[1]}x{image.shape[0]}"]
 
 
 def _table(path: Path, columns: str) -> IO[str]:

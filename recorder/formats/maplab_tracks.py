@@ -67,7 +67,9 @@ class Tracker:
         self._points: Points = np.zeros((0, 2), np.float32)
 
     def feed(self, picture: Image) -> None:
-        """Follow the points into the next gray picture (height, width), of the same size as those before."""
+        """Follow the points into the next gray picture (height, width)."""
+        if self._picture is not None and self._picture.shape != picture.shape:
+            self.end()
         if self._picture is not None and self._live:
             found, good = _followed(self._picture, picture, self._points)
             self._keep(found, good & _inside(found, picture))

@@ -131,6 +131,7 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
         finally:
             shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
-        name = error.filename if isinstance(error.filename, str) else str(out)
+        known = (error.filename2, error.filename)  # of a file that is copied: where to, where from
+        name = next((name for name in known if isinstance(name, str)), str(out))
         shown = name.replace(str(folder / out.name), str(out))
         raise StorageError(f"{shown}: {error.strerror or error}; nothing was left of it") from error

@@ -223,6 +223,19 @@ def test_without_calibration_there_are_tracks_only(twin: Path, tmp_path: Path) -
     assert any("no camera is calibrated" in note for note in summary.notes)
 
 
+def test_a_calibration_of_other_pictures_is_not_used(twin: Path, tmp_path: Path) -> None:
+    shutil.copytree(twin, tmp_path / "rec", copy_function=lambda a, b: Path(b).symlink_to(a))
+    text = (twin / "calibration.json").read_text()
+    (tmp_path / "rec/calibration.json").unlink()
+    (tmp_path / "rec/calibration.json").write_text(text.replace('"imageWidth": 640', '"imageWidth": 1280', 1))
+    summary = export(tmp_path / "rec", tmp_path / "out", "maplab", start_s=2.0, end_s=5.0)
+    assert any("camera left: no landmarks" in note and "1280x400" in note for note in summary.notes)
+    observations = table(mission(tmp_path / "out") / "observations.csv")
+    assert set(observations[:, 1]) == {1}
+    tracks = table(mission(tmp_path / "out") / "tracks.csv")
+    assert set(tracks[:, 2]) == {0, 1}
+
+
 def test_times_are_never_near_zero(make_recording: Callable[..., Path], tmp_path: Path) -> None:
     path = make_recording(seconds=0.5, lidar=False, frames=False)
     (path / "recording.json").unlink()
@@ -297,8 +310,10 @@ def test_a_track_is_of_bounded_length() -> None:
         keypoints = tracker.observe(vertex)
         assert keypoints.descriptors.shape == (len(keypoints.pixels), 32)
         assert keypoints.pixels.min() >= BORDER_PX
+    tracker.feed(picture[:-6])
+    assert tracker.observe(0).pixels.shape[1] == 2
     assert len(keypoints.tracks) > 3
-    assert {len(track.vertices) for track in tracker.ended} == {MAX_ROWS}
+    assert {len(track.vertices) for track in tracker.ended} == {MAX_ROWS, 5}
     assert all(number % 2 == 1 for number in keypoints.tracks)
 
 
