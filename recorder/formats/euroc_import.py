@@ -31,6 +31,7 @@ TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 LEICA = "leica0"
 CLOCK = "the time stamps of the EuRoC folder, taken as UTC"
 MAX_CAMERAS = 16
+MAX_NAME_BYTES = 255  # what file systems take
 
 Matrix = npt.NDArray[np.float64]
 
@@ -103,8 +104,8 @@ def _listed(index: int, camera: Path) -> Iterator[tuple[int, int, Path]]:
         time_ns = int(stamp)
         if last_ns is not None and time_ns <= last_ns:
             raise fault(table, number, f"{time_ns} after {last_ns}; the time stamps must ascend, sort the file")
-        if Path(name).name != name or "\0" in name:
-            raise fault(table, number, f"{name!r} is not a plain file name")
+        if Path(name).name != name or "\0" in name or len(name.encode()) > MAX_NAME_BYTES:
+            raise fault(table, number, f"{name[:MAX_NAME_BYTES]!r} is not a plain file name")
         path = camera / "data" / name
         if not path.is_file():
             raise fault(table, number, f"{path} is not there; fetch it, or remove the line")
