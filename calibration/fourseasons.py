@@ -1,4 +1,4 @@
-"""The 4Seasons dataset's calibration folder: calib_N.txt, calib_stereo.txt, camchain.yaml, and undistorted_*.txt.
+"""The 4Seasons dataset's calibration folder, in and out: calib_N.txt, calib_stereo.txt (undistorted_*.txt), camchain.yaml.
 
 A calib_N.txt has four lines: `Model fx fy cx cy` and four coefficients, `width height` of the input, what is done
 with it, `width height` of the output. calib_stereo.txt maps points of camera 0 into camera 1: the dataset's page says
@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.kalibr import SHIFT_KEY
+from calibration.kalibr import SHIFT_KEY, camchain, resolution
+from calibration.lens import intrinsics, second_from_first
 from calibration.model import Calibration, CalibrationError, Camera, to_matrix
 from calibration.sources import (
     FloatArray,
@@ -34,7 +35,7 @@ def read_4seasons(folder: Path, images: str) -> Imported:
     """Read the calibration of the "undistorted" or the "distorted" images. Raises CalibrationError."""
     prefix = "undistorted_" if images == "undistorted" else ""
     cameras = [_camera(folder / f"{prefix}calib_{index}.txt") for index in range(2)]
-    second_from_first = _matrix(folder / f"{prefix}calib_stereo.txt")
+    stereo = _matrix(folder / f"{prefix}calib_stereo.txt")
     chain_path = folder / "camchain.yaml"
     chain = read_yaml(chain_path)
     poses = []
@@ -47,14 +48,14 @@ def read_4seasons(folder: Path, images: str) -> Imported:
             (shift_s,) = numbers([entry["timeshift_cam_imu"]], f"{chain_path}: cam{index}: timeshift_cam_imu")
             cameras[index].extra[SHIFT_KEY] = -shift_s
     cameras[0].camera_from_imu = to_matrix(orthonormal(poses[0]))
-    cameras[1].camera_from_imu = to_matrix(orthonormal(second_from_first @ poses[0]))
+    cameras[1].camera_from_imu = to_matrix(orthonormal(stereo @ poses[0]))
     notes = []
     if images == "distorted":
         notes.append(
             "T_cam_imu belongs to the undistorted images (the dataset's authors say); it is taken for the distorted "
             "ones, which may be turned against them"
         )
-    apart_m = float(np.linalg.norm((second_from_first @ poses[0] - poses[1])[:3, 3]))
+    apart_m = float(np.linalg.norm((stereo @ poses[0] - poses[1])[:3, 3]))
     if apart_m > DISAGREE_M:
         notes.append(
             f"camera 1 is {1000 * apart_m:.1f} mm from where T_cam_imu of cam1 has it; {prefix}calib_stereo.txt counts"
@@ -90,3 +91,39 @@ def _parsed(words: list[str], path: Path) -> list[float]:
         return [float(word) for word in words]
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from error
+
+
+def is_undistorted(cameras: list[Camera]) -> bool:
+    """Whether the pictures of these cameras are what the dataset calls undistorted."""
+    return not any(any(camera.distortion_coefficients) for camera in cameras)
+
+
+def write_4seasons(cameras: list[Camera], folder: Path) -> list[str]:
+    """Write the files of two cameras; gives what could not be written, one line each. Raises OSError."""
+    notes = []
+    prefix = "undistorted_" if is_undistorted(cameras) else ""
+    for index, camera in enumerate(cameras):
+        text = _calib(camera)
+        if text is None:
+            notes.append(f"calib_{index}.txt: left out, the dataset has no lens {camera.model}")
+        else:
+            (folder / f"{prefix}calib_{index}.txt").write_text(text)
+    pose = second_from_first(Calibration(cameras=cameras), 0, 1) + 0.0  # no -0.0
+    rows = [" ".join(map(repr, row)) for row in pose.tolist()]
+    (folder / f"{prefix}calib_stereo.txt").write_text("\n".join(rows) + "\n")
+    (folder / "camchain.yaml").write_text(camchain(cameras))
+    return notes
+
+
+def _calib(camera: Camera) -> str | None:
+    """Text of calib_N.txt; None for a lens that the dataset does not have."""
+    coefficients = list(map(float, camera.distortion_coefficients))
+    if camera.model == "kannala-brandt4":
+        name = "Equidistant"
+    elif not any(coefficients):
+        name, coefficients = "Pinhole", []
+    else:
+        return None
+    values = [*intrinsics(camera), *(coefficients + [0.0] * 4)[:4]]
+    size = "{} {}".format(*resolution(camera))
+    return f"{name} {' '.join(map(repr, values))}\n{size}\ncrop\n{size}\n"

@@ -1,7 +1,9 @@
-"""Kalibr's results: camchain.yaml or camchain-imucam.yaml, and imu.yaml.
+"""Kalibr's files, in and out: camchain.yaml or camchain-imucam.yaml, and imu.yaml.
 
 Kalibr wiki, "Yaml formats": T_cn_cnm1 maps points of the camera before into this one, T_cam_imu those of the IMU;
-timeshift_cam_imu in seconds with t_imu = t_cam + timeshift.
+timeshift_cam_imu in seconds with t_imu = t_cam + timeshift. Kalibr knows the lenses radtan (k1 k2 p1 p2), which EuRoC
+calls radial-tangential and ROS plumb_bob, and equidistant (k1 k2 k3 k4). A lens that needs more keeps its own name and
+all its coefficients, in the order of OpenCV.
 """
 
 from __future__ import annotations
@@ -9,9 +11,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+import yaml
 
-from calibration.model import Calibration, CalibrationError
+from calibration.lens import intrinsics
+from calibration.model import COEFFICIENT_COUNTS, Calibration, CalibrationError, Camera
 from calibration.sources import FloatArray, Imported, image_size, make_camera, numbers, read_yaml, square
 
 SHIFT_KEY = "imuToCameraShiftSeconds"  # camera stamp minus IMU stamp of the same instant
@@ -22,9 +27,23 @@ NOISE_KEYS = {
     "gyroscope_random_walk": "gyroscopeRandomWalk",
     "update_rate": "updateRateHz",
 }
-MODELS = {"radtan": ("brown-conrady", (4,)), "equidistant": ("kannala-brandt4", (4,)), "none": ("pinhole", (0,))}
+RADTAN, EQUIDISTANT, NO_LENS = "radtan", "equidistant", "none"
+COUNTS = {RADTAN: (4, 5), "radial-tangential": (4, 5), "plumb_bob": (4, 5), EQUIDISTANT: (4,)}
 MAX_CAMERAS = 16
 NO_IMU = "the camchain does not know an IMU (no T_cam_imu)"
+
+
+class ImuNoise(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Noise of the IMU in Kalibr's terms and units (rad/s/sqrt(Hz), rad/s2/sqrt(Hz), m/s2/sqrt(Hz), m/s3/sqrt(Hz))."""
+
+    gyroscope_noise_density: float | None = None
+    gyroscope_random_walk: float | None = None
+    accelerometer_noise_density: float | None = None
+    accelerometer_random_walk: float | None = None
+
+    def known(self) -> dict[str, float]:
+        """Those that are given."""
+        return {key: value for key in ImuNoise.__struct_fields__ if (value := getattr(self, key)) is not None}
 
 
 def read_kalibr(paths: list[Path]) -> Imported:
@@ -106,15 +125,14 @@ def _lens(entry: dict[str, Any], where: str) -> tuple[str, list[float]]:
             f"{where}: camera_model {entry['camera_model']!r} cannot be written to a calibration.json; "
             "calibrate with pinhole-radtan or pinhole-equi"
         )
-    name = entry.get("distortion_model", "none")
-    if name not in MODELS:
-        known = ", ".join(MODELS)
-        raise CalibrationError(f"{where}: distortion_model {name!r} is not one of {known}")
-    model, counts = MODELS[name]
+    name = str(entry.get("distortion_model", NO_LENS))
     coefficients = numbers(entry.get("distortion_coeffs", []), f"{where}: distortion_coeffs")
-    if model == "pinhole":
-        return model, []
-    return model, numbers(coefficients, f"{where}: distortion_coeffs", counts)
+    lens = native_lens(name, coefficients)
+    if lens is None:
+        numbers(coefficients, f"{where}: distortion_coeffs", COUNTS.get(name))
+        known = ", ".join((RADTAN, EQUIDISTANT, NO_LENS))
+        raise CalibrationError(f"{where}: distortion_model {name!r} is not one of {known}")
+    return lens
 
 
 def _noise(path: Path, root: dict[str, Any]) -> dict[str, float]:
@@ -122,3 +140,66 @@ def _noise(path: Path, root: dict[str, Any]) -> dict[str, float]:
     if not isinstance(entry, dict):
         raise CalibrationError(f"{path}: imu0: must be a mapping")
     return {name: numbers([entry[key]], f"{path}: {key}")[0] for key, name in NOISE_KEYS.items() if key in entry}
+
+
+def native_lens(name: str, coefficients: list[float]) -> tuple[str, list[float]] | None:
+    """Model and coefficients as in calibration.json, of a lens by its name here; None where it has no place there."""
+    if name == NO_LENS:
+        return None if any(coefficients) else ("pinhole", [])
+    if name in COUNTS:
+        if len(coefficients) not in COUNTS[name]:
+            return None
+        return ("kannala-brandt4" if name == EQUIDISTANT else "brown-conrady"), coefficients
+    counts = COEFFICIENT_COUNTS.get(name, ())
+    return (name, coefficients) if counts is None or len(coefficients) in counts else None
+
+
+def kalibr_lens(camera: Camera) -> tuple[str, list[float]]:
+    """Kalibr's name and coefficients of a lens; its own ones where Kalibr has none."""
+    coefficients = list(map(float, camera.distortion_coefficients))
+    if camera.model == "kannala-brandt4":
+        return EQUIDISTANT, coefficients or [0.0] * 4
+    if camera.model not in ("pinhole", "brown-conrady"):
+        return camera.model, coefficients
+    if camera.model == "pinhole" and len(coefficients) == 3:  # radial only
+        coefficients = [coefficients[0], coefficients[1], 0.0, 0.0, coefficients[2]]
+    if any(coefficients[4:]):
+        return camera.model, coefficients
+    return RADTAN, (coefficients + [0.0] * 4)[:4]
+
+
+def resolution(camera: Camera) -> list[int]:
+    """Width and height; 0 where the calibration does not say."""
+    return [camera.image_width_px or 0, camera.image_height_px or 0]
+
+
+def camchain(cameras: list[Camera]) -> str:
+    """Text of camchain.yaml."""
+    chain: dict[str, Any] = {}
+    for index, camera in enumerate(cameras):
+        name, coefficients = kalibr_lens(camera)
+        entry: dict[str, Any] = {"T_cam_imu": camera.matrix.tolist()}
+        if index:
+            entry["T_cn_cnm1"] = (camera.matrix @ np.linalg.inv(cameras[index - 1].matrix)).tolist()
+        entry |= {
+            "cam_overlaps": [other for other in range(len(cameras)) if other != index],
+            "camera_model": "pinhole",
+            "distortion_coeffs": coefficients,
+            "distortion_model": name,
+            "intrinsics": intrinsics(camera),
+            "resolution": resolution(camera),
+            "rostopic": f"/cam{index}/image_raw",
+            "timeshift_cam_imu": 0.0,
+        }
+        chain[f"cam{index}"] = entry
+    return to_yaml(chain)
+
+
+def imu_yaml(noise: ImuNoise, rate_hz: float) -> str:
+    """Text of imu.yaml, with the noise that is known."""
+    return to_yaml(noise.known() | {"rostopic": "/imu0", "update_rate": rate_hz})
+
+
+def to_yaml(values: dict[str, Any]) -> str:
+    """YAML with lists of numbers on one line, numbers with all their digits."""
+    return yaml.safe_dump(values, default_flow_style=None, sort_keys=False, width=100_000)

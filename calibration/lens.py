@@ -57,6 +57,11 @@ def unproject(camera: Camera, pixels: FloatArray) -> FloatArray:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
+def intrinsics(camera: Camera) -> list[float]:
+    """fx, fy, cx, cy in pixels."""
+    return [*map(float, (*_focal_px(camera), *_centre_px(camera)))]
+
+
 def second_from_first(calibration: Calibration, first: int, second: int) -> FloatArray:
     """(4, 4): maps points from one camera's frame into another's."""
     cameras = calibration.cameras

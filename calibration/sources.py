@@ -92,7 +92,7 @@ def make_camera(
     model: str,
     intrinsics: list[float],
     coefficients: list[float],
-    size: tuple[int, int],
+    size: tuple[int | None, int | None],
     pose: FloatArray | None = None,
 ) -> Camera:
     """A camera from fx fy cx cy; brown-conrady coefficients k1 k2 p1 p2 k3 ... are filled up to eight with zeros."""

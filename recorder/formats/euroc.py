@@ -16,19 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.kalibr import EQUIDISTANT, RADTAN, ImuNoise, camchain, imu_yaml, kalibr_lens, resolution, to_yaml
+from calibration.lens import intrinsics
 from calibration.model import Camera
 from recorder.formats import Exporter, FormatError
 from recorder.formats.common import chosen_poses, epoch_ns, paired_imu, rate_hz
-from recorder.formats.kalibr import (
-    RADTAN,
-    ImuNoise,
-    camchain,
-    imu_yaml,
-    intrinsics,
-    kalibr_lens,
-    resolution,
-    to_yaml,
-)
 from recorder.formats.png import PngWriter
 from recorder.formats.report import Report
 from recorder.recording.model import Recording
@@ -178,7 +170,7 @@ def _camera_sensor(name: str, camera: Camera | None, rate: float, report: Report
         report.note(f"camera {name} is not calibrated: its sensor.yaml has no lens")
         return sensor | {"rate_hz": rate}
     model, coefficients = kalibr_lens(camera)
-    if model not in (RADTAN, "equidistant"):
+    if model not in (RADTAN, EQUIDISTANT):
         report.note(f"camera {name}: programs that know radial-tangential and equidistant only cannot use lens {model}")
     return sensor | {
         "T_BS": _matrix(np.linalg.inv(camera.matrix).astype(np.float64)),

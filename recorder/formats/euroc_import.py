@@ -13,18 +13,17 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from calibration.model import Calibration, Camera
-from calibration.model import Matrix as Matrix4
+from calibration.kalibr import native_lens
+from calibration.model import Calibration
+from calibration.sources import make_camera, numbers, read_yaml
 from drivers.samples import FixSample, ImuSample, PoseSample
 from recorder.formats import FormatError, Importer, NoOptions, PictureSet, Source, Stream
-from recorder.formats.kalibr import native_lens, numbers, read_yaml
 from recorder.formats.png import Image, map_ahead, read_image
+from recorder.formats.quaternions import from_matrix, matrices
 from recorder.formats.report import Report
-from recorder.formats.rotations import from_matrix, matrices
 from recorder.formats.text import BEYOND, MAX_TIME_NS, count_lines, fault, read_lines, read_table
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
@@ -37,7 +36,7 @@ Matrix = npt.NDArray[np.float64]
 
 
 def read_euroc(source: Path, _options: NoOptions, report: Report) -> Source:
-    """Look at a folder that holds mav0, or is it. Raises FormatError."""
+    """Look at a folder that holds mav0, or is it. Raises FormatError, CalibrationError."""
     mav0 = source / "mav0" if (source / "mav0").is_dir() else source
     cameras = list(itertools.takewhile(Path.is_dir, (mav0 / f"cam{index}" for index in range(MAX_CAMERAS))))
     has_imu = (mav0 / "imu0/data.csv").is_file()
@@ -169,7 +168,8 @@ def _fixes(path: Path) -> Iterator[tuple[int, FixSample]]:
 
 
 def _sensor(folder: Path) -> dict[str, Any]:
-    return read_yaml(folder / "sensor.yaml") or {}
+    path = folder / "sensor.yaml"
+    return read_yaml(path) if path.exists() else {}
 
 
 def _rate_hz(folder: Path) -> float | None:
@@ -183,7 +183,7 @@ def _body_from(folder: Path) -> Matrix:
     if entry is None:
         return np.eye(4)
     where = f"{folder / 'sensor.yaml'}: T_BS.data"
-    matrix = np.array(numbers(entry.get("data") if isinstance(entry, dict) else entry, 16, where)).reshape(4, 4)
+    matrix = np.array(numbers(entry.get("data") if isinstance(entry, dict) else entry, where, (16,))).reshape(4, 4)
     if abs(np.linalg.det(matrix[:3, :3]) - 1) > 1e-2 or matrix[3].tolist() != [0, 0, 0, 1]:
         raise FormatError(f"{where}: must be a rotation and a translation, row by row")
     return matrix
@@ -197,29 +197,18 @@ def _calibration(cameras: list[Path], body_from_imu: Matrix, report: Report) -> 
         if "intrinsics" not in sensor or "T_BS" not in sensor:
             report.note(f"{where}: no intrinsics or no T_BS in it; the recording has no calibration.json")
             return None
-        fu, fv, cu, cv = numbers(sensor["intrinsics"], 4, f"{where}: intrinsics")
+        intrinsics = numbers(sensor["intrinsics"], f"{where}: intrinsics", (4,))
         name = str(sensor.get("distortion_model", "none"))
-        coefficients = numbers(sensor.get("distortion_coefficients", []), None, f"{where}: distortion_coefficients")
+        coefficients = numbers(sensor.get("distortion_coefficients", []), f"{where}: distortion_coefficients")
         lens = native_lens(name, coefficients)
         if lens is None or sensor.get("camera_model", "pinhole") != "pinhole":
             told = f"{sensor.get('camera_model', 'pinhole')} {name} with {len(coefficients)} coefficients"
             report.note(f"{where}: lens {told} has no place in calibration.json, which is left out")
             return None
-        size = [int(value) or None for value in numbers(sensor.get("resolution", [0, 0]), 2, f"{where}: resolution")]
-        matrix = np.linalg.inv(_body_from(folder)) @ body_from_imu + 0.0  # no -0.0
-        found.append(
-            Camera(
-                model=lens[0],
-                focal_length_x_px=fu,
-                focal_length_y_px=fv,
-                principal_point_x_px=cu,
-                principal_point_y_px=cv,
-                camera_from_imu=msgspec.convert(matrix.tolist(), Matrix4),
-                distortion_coefficients=lens[1],
-                image_width_px=size[0],
-                image_height_px=size[1],
-            )
-        )
+        width, height = numbers(sensor.get("resolution", [0, 0]), f"{where}: resolution", (2,))
+        size = int(width) or None, int(height) or None
+        pose = np.linalg.inv(_body_from(folder)) @ body_from_imu + 0.0  # no -0.0
+        found.append(make_camera(lens[0], intrinsics, lens[1], size, pose))
     return Calibration(cameras=found) if found else None
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibration.model import Camera
+from calibration.fourseasons import is_undistorted, write_4seasons
 from recorder.formats import Exporter, FormatError
 from recorder.formats.common import chosen_poses, epoch_ns, paired_imu
 from recorder.formats.fourseasons_frames import (
@@ -29,7 +29,6 @@ from recorder.formats.fourseasons_frames import (
     read_transformations,
 )
 from recorder.formats.importing import FILES_FOLDER
-from recorder.formats.kalibr import camchain
 from recorder.formats.png import PngWriter
 from recorder.formats.report import Report
 from recorder.formats.text import read_table
@@ -99,11 +98,8 @@ def _write_cameras(recording: Recording, out: Path, zero_ns: int, report: Report
     if not len(frames):
         return
     cameras = recording.calibration.cameras if recording.calibration else []
-    is_undistorted = bool(cameras) and not any(any(camera.distortion_coefficients) for camera in cameras)
-    folders = [
-        out / ("undistorted_images" if is_undistorted else "distorted_images") / f"cam{index}"
-        for index in range(min(2, len(frames.cameras)))
-    ]
+    kind = "undistorted_images" if cameras and is_undistorted(cameras) else "distorted_images"
+    folders = [out / kind / f"cam{index}" for index in range(min(2, len(frames.cameras)))]
     for folder in folders:
         folder.mkdir(parents=True)
     if len(frames.cameras) > 2:
@@ -232,36 +228,9 @@ def _write_calibration(recording: Recording, out: Path, report: Report) -> None:
     if len(cameras) < 2:
         report.note("calibration: left out, the recording knows no two cameras")
         return
-    folder = out / "calibration"
-    folder.mkdir()
-    is_undistorted = not any(any(camera.distortion_coefficients) for camera in cameras)
-    prefix = "undistorted_" if is_undistorted else ""
-    for index, camera in enumerate(cameras):
-        text = _calib(camera)
-        if text is None:
-            report.note(f"calib_{index}.txt: left out, the dataset has no lens {camera.model}")
-        else:
-            (folder / f"{prefix}calib_{index}.txt").write_text(text)
-    second_from_first = cameras[1].matrix @ np.linalg.inv(cameras[0].matrix)
-    rows = [" ".join(map(repr, row)) for row in (second_from_first + 0.0).tolist()]
-    (folder / f"{prefix}calib_stereo.txt").write_text("\n".join(rows) + "\n")
-    (folder / "camchain.yaml").write_text(camchain(cameras))
-
-
-def _calib(camera: Camera) -> str | None:
-    coefficients = list(map(float, camera.distortion_coefficients))
-    if camera.model == "kannala-brandt4":
-        model = "Equidistant"
-    elif not any(coefficients):
-        model, coefficients = "Pinhole", []
-    else:
-        return None
-    numbers = [
-        camera.focal_length_x_px, camera.focal_length_y_px, camera.principal_point_x_px, camera.principal_point_y_px,
-        *(coefficients + [0.0] * 4)[:4],
-    ]  # fmt: skip
-    size = f"{camera.image_width_px or 0} {camera.image_height_px or 0}"
-    return f"{model} {' '.join(repr(float(number)) for number in numbers)}\n{size}\ncrop\n{size}\n"
+    (out / "calibration").mkdir()
+    for note in write_4seasons(cameras, out / "calibration"):
+        report.note(note)
 
 
 EXPORTER = Exporter(FourSeasonsExportOptions, write_fourseasons)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recorder.formats import FormatError
-from recorder.formats.rotations import conjugated, from_matrix, multiplied, rotated
+from recorder.formats.quaternions import conjugated, from_matrix, multiplied, rotated
 from recorder.formats.text import fault
 
 Floats = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from calibration.fourseasons import read_4seasons
-from calibration.model import Calibration, CalibrationError
+from calibration.model import Calibration
 from drivers.gnss.nmea_decoder import NmeaDecoder
 from drivers.samples import FixSample, ImuSample, PoseSample
 from recorder.formats import FormatError, Importer, PictureSet, Source, Stream
@@ -55,7 +55,7 @@ class Frame:
 
 
 def read_fourseasons(source: Path, options: FourSeasonsOptions, report: Report) -> Source:
-    """Look at a folder of the dataset. Raises FormatError."""
+    """Look at a folder of the dataset. Raises FormatError, CalibrationError."""
     frames = list(_frames(source / "times.txt")) if (source / "times.txt").is_file() else []
     images = options.images or ("undistorted" if (source / "undistorted_images").is_dir() else "distorted")
     streams: list[Stream] = []
@@ -202,10 +202,7 @@ def _calibration(source: Path, images: Images, options: FourSeasonsOptions, repo
             raise FormatError(f"--set calibration: {options.calibration} is not a folder")
         report.note("there is no folder calibration: the recording has none")
         return None
-    try:
-        found = read_4seasons(folder, images)
-    except CalibrationError as error:
-        raise FormatError(str(error)) from error
+    found = read_4seasons(folder, images)
     for note in found.notes:
         report.note(note)
     return found.calibration

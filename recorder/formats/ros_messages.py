@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from calibration.kalibr import kalibr_lens
+from calibration.lens import intrinsics
 from calibration.model import Camera
 from drivers.samples import POINT_DTYPE
-from recorder.formats.kalibr import kalibr_lens
-from recorder.formats.rotations import from_matrix
+from recorder.formats.quaternions import from_matrix
 from recorder.recording.manifest import NS_PER_S
 
 Floats = npt.NDArray[np.float64]
@@ -144,8 +145,7 @@ class Messages:
         """sensor_msgs/CameraInfo; a lens that ROS has no name for keeps ours."""
         name, coefficients = kalibr_lens(camera)
         model, count = DISTORTION.get(name, (name, len(coefficients)))
-        fu, fv = float(camera.focal_length_x_px), float(camera.focal_length_y_px)
-        cu, cv = float(camera.principal_point_x_px), float(camera.principal_point_y_px)
+        fu, fv, cu, cv = intrinsics(camera)
         matrices = {
             "d": np.array((coefficients + [0.0] * count)[:count]),
             "k": np.array([fu, 0, cu, 0, fv, cv, 0, 0, 1]),

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import recorder
+from calibration.model import CalibrationError
 from recorder.errors import ConfigError, StorageError
 from recorder.formats import (
     EXPORTERS,
@@ -74,10 +75,13 @@ def import_(
     if not source.exists():
         raise FormatError(f"{source}: there is no such file or folder")
     with whole_or_nothing(out) as unfinished:
-        found = importer.read(source, options, report)
-        write_source(
-            found, unfinished, report, _span_ns(start_s, end_s), {"format": format_name, "source": str(source)}
-        )
+        try:
+            found = importer.read(source, options, report)
+            write_source(
+                found, unfinished, report, _span_ns(start_s, end_s), {"format": format_name, "source": str(source)}
+            )
+        except CalibrationError as error:
+            raise FormatError(str(error)) from error
     on_progress(1.0)
     return report.summary(format_name, str(source), str(out))
 

@@ -30,8 +30,7 @@ from recorder.formats.graph import (
     write_graph,
 )
 from recorder.formats.importing import FILES_FOLDER
-from recorder.formats.report import Report
-from recorder.formats.rotations import (
+from recorder.formats.quaternions import (
     conjugated,
     from_roll_pitch_yaw,
     from_rotation_vector,
@@ -41,6 +40,7 @@ from recorder.formats.rotations import (
     rotation_vector,
     yaw,
 )
+from recorder.formats.report import Report
 from recorder.formats.text import fault, read_lines
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording

@@ -11,8 +11,8 @@ import numpy as np
 
 from recorder.formats import Exporter
 from recorder.formats.common import epoch_ns, needed_poses
+from recorder.formats.quaternions import matrices
 from recorder.formats.report import Report
-from recorder.formats.rotations import matrices
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording
 from recorder.recording.series import Poses

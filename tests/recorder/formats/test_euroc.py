@@ -192,7 +192,7 @@ STAMP = UTC_NS + 100_000_000
         ("cam0/data.csv", f"{STAMP},{STAMP}.png", f"{STAMP}", r"cam0/data\.csv: line 3: expected"),
         ("cam0/data.csv", f"{STAMP}.png", "9" * 300, r"cam0/data\.csv: line 3: '9{255}' is not a plain file name"),
         ("cam1/sensor.yaml", "intrinsics: [", "intrinsics: [x, ", r"cam1/sensor\.yaml: intrinsics: must be"),
-        ("cam1/sensor.yaml", "data: [", "data: [5.0, ", r"cam1/sensor\.yaml: T_BS\.data: must be 16 finite"),
+        ("cam1/sensor.yaml", "data: [", "data: [5.0, ", r"cam1/sensor\.yaml: T_BS\.data: must be 16 numbers, got 17"),
         ("cam1/sensor.yaml", "sensor_type:", "}{:", r"cam1/sensor\.yaml: not valid YAML"),
         ("state_groundtruth_estimate0/data.csv", ",-0.3,", ",-0.3,7,", r"18 columns, expected 8 to 17"),
     ],

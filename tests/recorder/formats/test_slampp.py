@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import recorder
 from recorder.formats import FormatError
 from recorder.formats.graph import Edge, inverted, matrix, read_graph, renumbered, upper, write_graph
-from recorder.formats.rotations import from_roll_pitch_yaw, from_rotation_vector, roll_pitch_yaw, rotation_vector
+from recorder.formats.quaternions import from_roll_pitch_yaw, from_rotation_vector, roll_pitch_yaw, rotation_vector
 from recorder.formats.running import export, import_
 
 gtsam = pytest.importorskip("gtsam")
