@@ -1,4 +1,4 @@
-"""The 4Seasons dataset's calibration folder, in and out: calib_N.txt, calib_stereo.txt (undistorted_*.txt), camchain.yaml.
+"""The 4Seasons dataset's calibration folder, in and out: calib_N.txt, calib_stereo.txt (undistorted_*), camchain.yaml.
 
 A calib_N.txt has four lines: `Model fx fy cx cy` and four coefficients, `width height` of the input, what is done
 with it, `width height` of the output. calib_stereo.txt maps points of camera 0 into camera 1: the dataset's page says
