@@ -20,6 +20,7 @@ from calibration.model import COEFFICIENT_COUNTS, Calibration, CalibrationError,
 from calibration.sources import FloatArray, Imported, image_size, make_camera, numbers, read_yaml, square
 
 SHIFT_KEY = "imuToCameraShiftSeconds"  # camera stamp minus IMU stamp of the same instant
+NOISE_KEY = "imuNoise"
 NOISE_KEYS = {
     "accelerometer_noise_density": "accelerometerNoiseDensity",
     "accelerometer_random_walk": "accelerometerRandomWalk",
@@ -68,7 +69,7 @@ def read_kalibr(paths: list[Path]) -> Imported:
     imported = _chain(*chains[0])
     imported.notes += notes
     if noise:
-        imported.calibration.extra["imuNoise"] = noise
+        imported.calibration.extra[NOISE_KEY] = noise
     return imported
 
 
@@ -178,6 +179,7 @@ def camchain(cameras: list[Camera]) -> str:
     chain: dict[str, Any] = {}
     for index, camera in enumerate(cameras):
         name, coefficients = kalibr_lens(camera)
+        shift_s = camera.extra.get(SHIFT_KEY)
         entry: dict[str, Any] = {"T_cam_imu": camera.matrix.tolist()}
         if index:
             entry["T_cn_cnm1"] = (camera.matrix @ np.linalg.inv(cameras[index - 1].matrix)).tolist()
@@ -189,10 +191,19 @@ def camchain(cameras: list[Camera]) -> str:
             "intrinsics": intrinsics(camera),
             "resolution": resolution(camera),
             "rostopic": f"/cam{index}/image_raw",
-            "timeshift_cam_imu": 0.0,
+            "timeshift_cam_imu": 0.0 - shift_s if isinstance(shift_s, int | float) else 0.0,
         }
         chain[f"cam{index}"] = entry
     return to_yaml(chain)
+
+
+def stored_noise(calibration: Calibration | None) -> ImuNoise:
+    """What a calibration.json knows of it, from an imu.yaml that was read."""
+    stored = calibration.extra.get(NOISE_KEY) if calibration else None
+    if not isinstance(stored, dict):
+        return ImuNoise()
+    values = {key: stored.get(NOISE_KEYS[key]) for key in ImuNoise.__struct_fields__}
+    return ImuNoise(**{key: float(value) for key, value in values.items() if isinstance(value, int | float)})
 
 
 def imu_yaml(noise: ImuNoise, rate_hz: float) -> str:

@@ -42,7 +42,7 @@ from simulated_devices.replayed import (
     SerialReplay,
 )
 from simulated_devices.rig import SimulatedDevice, Simulation, UdpPorts
-from simulated_devices.timing import SECOND_NS, Int64Array, Stage
+from simulated_devices.timing import SECOND_NS, WORLD_START_DELAY_NS, Int64Array, Stage
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +55,7 @@ POSE_PORT = 5005
 MICROSECOND_NS = 1000
 # Nothing can be sent again, so whoever opened the devices must have stopped to wait for the silent ones, and read.
 SETTLE_NS = 7 * SECOND_NS
+BEGINS_S = (SETTLE_NS + WORLD_START_DELAY_NS) // SECOND_NS
 
 
 def replay(folder: Path, speed: float, *, report: bool = False) -> Simulation:
@@ -63,7 +64,7 @@ def replay(folder: Path, speed: float, *, report: bool = False) -> Simulation:
     bill = Playbill(folder, stage, speed)
     for reason in bill.left_out:
         log.warning("left out: %s", reason)
-    log.warning("replaying %.1f s, %d s after all devices have been opened", bill.duration_s, SETTLE_NS // SECOND_NS)
+    log.warning("replaying %.1f s, beginning %d s after the first device is opened", bill.duration_s, BEGINS_S)
     return Simulation(bill.devices, bill.document, stage, bill.ports, settle_ns=SETTLE_NS, report=report)
 
 

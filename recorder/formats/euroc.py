@@ -16,7 +16,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.kalibr import EQUIDISTANT, RADTAN, ImuNoise, camchain, imu_yaml, kalibr_lens, resolution, to_yaml
+from calibration.kalibr import (
+    EQUIDISTANT,
+    RADTAN,
+    ImuNoise,
+    camchain,
+    imu_yaml,
+    kalibr_lens,
+    resolution,
+    stored_noise,
+    to_yaml,
+)
 from calibration.lens import intrinsics
 from calibration.model import Camera
 from recorder.formats import Exporter, FormatError
@@ -81,9 +91,10 @@ def _write_imu(recording: Recording, out: Path, zero_ns: int, options: EurocOpti
         "T_BS": _matrix(np.eye(4)),
         "rate_hz": rate,
     }
-    (out / "mav0/imu0/sensor.yaml").write_text(to_yaml(sensor | options.known()))
-    (out / "imu.yaml").write_text(imu_yaml(options, rate))
-    missing = [key for key in ImuNoise.__struct_fields__ if key not in options.known()]
+    noise = ImuNoise(**stored_noise(recording.calibration).known() | options.known())
+    (out / "mav0/imu0/sensor.yaml").write_text(to_yaml(sensor | noise.known()))
+    (out / "imu.yaml").write_text(imu_yaml(noise, rate))
+    missing = [key for key in ImuNoise.__struct_fields__ if key not in noise.known()]
     if missing:
         report.note(f"imu.yaml lacks what the recording does not know: {', '.join(missing)} (give them with --set)")
 

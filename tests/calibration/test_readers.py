@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from calibration.fourseasons import read_4seasons
 from calibration.imu_pose import AS_DESIGNED, axes_rotation, designed
-from calibration.kalibr import read_kalibr
+from calibration.kalibr import camchain, imu_yaml, read_kalibr, stored_noise
 from calibration.model import Calibration, CalibrationError, dump, validate
 from calibration.oak import NO_IMU, OakCamera, cropped, from_eeprom, full_size, read_eeprom, stereo_sockets
 from calibration.opencv_yaml import read_opencv
@@ -81,6 +81,26 @@ def test_kalibr_chain_with_imu(tmp_path: Path) -> None:
     }
     assert imported.notes == ["imu.yaml: noise of the IMU kept as imuNoise"]
     assert validate(imported.calibration) == []
+
+
+def test_kalibr_files_written_are_read_the_same(tmp_path: Path) -> None:
+    first = read_kalibr(write(tmp_path, imu=IMU, chain=CAMCHAIN)).calibration
+    noise = stored_noise(first)
+    assert noise.known() == {"accelerometer_noise_density": 0.01, "gyroscope_random_walk": 1e-5}
+    again = read_kalibr(write(tmp_path, imu=imu_yaml(noise, 200.0), chain=camchain(first.cameras))).calibration
+    assert again.extra == first.extra
+    for before, after in zip(first.cameras, again.cameras, strict=True):
+        assert np.allclose(after.matrix, before.matrix, rtol=0, atol=1e-12)
+        assert (after.model, after.distortion_coefficients) == (before.model, before.distortion_coefficients)
+        assert after.extra.get("imuToCameraShiftSeconds", 0.0) == before.extra.get("imuToCameraShiftSeconds", 0.0)
+
+
+def test_a_lens_that_kalibr_lacks_keeps_its_name(tmp_path: Path) -> None:
+    chain = read_kalibr(write(tmp_path, chain=CAMCHAIN)).calibration
+    chain.cameras[0].distortion_coefficients = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]
+    written = write(tmp_path, chain=camchain(chain.cameras))
+    assert "distortion_model: brown-conrady" in written[0].read_text()
+    assert read_kalibr(written).calibration.cameras[0].distortion_coefficients[7] == 0.8
 
 
 def test_kalibr_chain_without_imu_says_so(tmp_path: Path) -> None:
