@@ -13,6 +13,7 @@ import numpy.typing as npt
 from calibration.boards import Board, Corners
 from calibration.lens import project, unproject
 from calibration.model import CalibrationError, Camera, to_matrix
+from calibration.sources import pose_of
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -241,8 +242,7 @@ def _camera(model: str, matrix: FloatArray, coefficients: list[float], size: tup
 def _with_errors(board: Board, views: _Views, camera: Camera, turns: Sequence[Any], shifts: Sequence[Any]) -> Fit:
     poses, errors = [], []
     for corners, turn, shift in zip(views.corners, turns, shifts, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+        pose = pose_of(cv2.Rodrigues(turn)[0], np.ravel(shift))
         poses.append(pose)
         expected = project(camera, _moved(board.points_m[corners.ids], pose))
         errors.append(np.nan_to_num(corners.pixels - expected, nan=IMPOSSIBLE_PX))
@@ -362,9 +362,7 @@ def _board_pose(camera: Camera, points_m: FloatArray, corners: Corners) -> Float
             break
     else:
         raise CalibrationError("a view of the board fits no place of it; is it the right board?")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    return pose
+    return pose_of(cv2.Rodrigues(turn)[0], np.ravel(shift))
 
 
 def _median_pose(poses: list[FloatArray]) -> FloatArray:

@@ -55,6 +55,29 @@ class Framer:
         return frames
 
 
+@dataclass(slots=True, kw_only=True)
+class FramedDecoder:
+    """What decoders tell that find their frames with a Framer.
+
+    frames: how many came, of any kind. starts: for each sample of the last `feed`, how many bytes had been fed before
+    its first byte.
+    """
+
+    framer: Framer
+    frames: int = 0
+    starts: list[int] = field(default_factory=list)
+
+    @property
+    def bad_frames(self) -> int:
+        """Candidates for a frame that were none."""
+        return self.framer.bad_frames
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes outside of frames; the ends of lines count."""
+        return self.framer.skipped_bytes
+
+
 @dataclass(slots=True)
 class StepCounter:
     """Counts messages that are missing between device times, for protocols without a message counter.

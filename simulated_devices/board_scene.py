@@ -21,6 +21,7 @@ from simulated_devices.scene import (
     PinholeCamera,
     Room,
     SensorNoise,
+    levels_of,
     stereo_pair,
 )
 
@@ -92,20 +93,10 @@ class BoardWall:
         self.board_at_mm = tuple(at / TEXELS_PER_MM + frame_mm for at in (left, top))
         middle_mm = [at + side / 2 for at, side in zip(self.board_at_mm, self._board_mm(), strict=True)]
         self.corner_m: FloatArray = np.array([DISTANCE_M, middle_mm[0] / 1000, middle_mm[1] / 1000])
-        self.levels = _levels(wall)
+        self.levels = levels_of(wall, LEVELS)
 
     def _board_mm(self) -> tuple[float, float]:
         return self.board.width_mm, self.board.height_mm
-
-
-def _levels(wall: Image) -> tuple[Image, ...]:
-    level: Image = cv2.GaussianBlur(wall, (0, 0), TEXEL_SIGMA)
-    levels = [level]
-    for _ in range(LEVELS - 1):
-        blurred = cv2.GaussianBlur(level, (0, 0), TEXEL_SIGMA * np.sqrt(3.0))
-        level = cv2.resize(blurred, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        levels.append(level)
-    return tuple(levels)
 
 
 class BoardRenderer:

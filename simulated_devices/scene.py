@@ -53,7 +53,7 @@ class Room:
         for axis, across in enumerate(((1, 2), (0, 2), (0, 1))):
             columns, rows = (round(2 * self.half_size_m[a] / TEXEL_M) for a in across)
             for sign in (-1, 1):
-                faces.append(Face(axis, sign, across, _levels(_wallpaper(rows, columns, generator))))
+                faces.append(Face(axis, sign, across, levels_of(_wallpaper(rows, columns, generator), LEVELS)))
         self.faces: tuple[Face, ...] = tuple(faces)
         self.coarse = CoarseRoom(self)
 
@@ -130,11 +130,11 @@ def _seam(rows: int, columns: int) -> npt.NDArray[np.float32]:
     return np.outer(weights[0], weights[1])
 
 
-def _levels(picture: Image) -> tuple[Image, ...]:
-    """Band-limited copies, each half as fine as the one before."""
+def levels_of(picture: Image, count: int) -> tuple[Image, ...]:
+    """So many band-limited copies, each half as fine as the one before."""
     level: Image = cv2.GaussianBlur(picture, (0, 0), TEXEL_SIGMA)
     levels = [level]
-    for _ in range(LEVELS - 1):
+    for _ in range(count - 1):
         blurred = cv2.GaussianBlur(level, (0, 0), TEXEL_SIGMA * np.sqrt(3.0))
         level = cv2.resize(blurred, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         levels.append(level)

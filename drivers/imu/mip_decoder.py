@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Literal
 
-from drivers.framing import Framer, StepCounter
+from drivers.framing import FramedDecoder, Framer, StepCounter
 from drivers.samples import ImuSample, Vector
 
 SYNC = b"\x75\x65"
@@ -92,33 +92,20 @@ def _length(buffer: bytearray, position: int) -> int | None:
 
 
 @dataclass(slots=True)
-class MipDecoder:
+class MipDecoder(FramedDecoder):
     """Measurements out of a MIP stream.
 
     time_source: which field stamps a sample: nanoseconds since start (reference), the GPS correlation time of older
     devices in nanoseconds, or the tick counter. gps_time: the last that came, with the device ticks it came with.
-    lost_messages: holes in the device time. frames: how many packets came, of any kind. replies: the latest of the
-    command sets. starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
+    lost_messages: holes in the device time. replies: the latest of the command sets.
     """
 
     time_source: TimeSource = "reference"
-    frames: int = 0
     gps_time: tuple[int | None, GpsTime] | None = None
     replies: deque[Packet] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
-    starts: list[int] = field(default_factory=list)
     steps: StepCounter = field(default_factory=StepCounter)
-    framer: Framer = field(default_factory=lambda: Framer(_START, _length))
+    framer: Framer = field(default_factory=lambda: Framer(_START, _length), kw_only=True)
     _ticks_of_last: int | None = None
-
-    @property
-    def bad_frames(self) -> int:
-        """Candidates for a packet that were none."""
-        return self.framer.bad_frames
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Bytes outside of packets."""
-        return self.framer.skipped_bytes
 
     @property
     def lost_messages(self) -> int:

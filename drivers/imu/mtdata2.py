@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any
 
-from drivers.framing import Framer, SequenceCounter
+from drivers.framing import FramedDecoder, Framer, SequenceCounter
 from drivers.samples import ImuSample, Vector
 
 MTDATA2 = 0x36
@@ -97,20 +97,17 @@ def _items_fill(buffer: bytearray, position: int, end: int) -> bool:
 
 
 @dataclass(slots=True)
-class Mtdata2Decoder:
+class Mtdata2Decoder(FramedDecoder):
     """Measurements out of an XBus stream.
 
     magnetic_field_ut: strength of the local field in µT: the device's magnetometer unit is about one local field.
     lost_messages: holes in the packet counter, measurements without inertial data included.
-    frames: how many frames came, of any kind. replies: the latest that are no measurement, for who cares to take them.
-    starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
+    replies: the latest frames that are no measurement, for who cares to take them.
     """
 
     magnetic_field_ut: float = 50.0
-    frames: int = 0
     replies: deque[Message] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
-    starts: list[int] = field(default_factory=list)
-    framer: Framer = field(default_factory=xbus_framer)
+    framer: Framer = field(default_factory=xbus_framer, kw_only=True)
     _shapes: "dict[int, _Shape]" = field(default_factory=dict)
     _counter: SequenceCounter = field(default_factory=lambda: SequenceCounter(16))
     _ticks: int | None = None
@@ -119,16 +116,6 @@ class Mtdata2Decoder:
     def lost_messages(self) -> int:
         """Messages missing in the packet counter."""
         return self._counter.lost
-
-    @property
-    def bad_frames(self) -> int:
-        """Candidates for a frame that were none."""
-        return self.framer.bad_frames
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Bytes outside of frames."""
-        return self.framer.skipped_bytes
 
     def feed(self, data: bytes) -> list[ImuSample]:
         """The samples that `data` completes."""

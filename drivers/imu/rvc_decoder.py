@@ -7,7 +7,7 @@ import re
 import struct
 from dataclasses import dataclass, field
 
-from drivers.framing import Framer, SequenceCounter
+from drivers.framing import FramedDecoder, Framer, SequenceCounter
 from drivers.samples import ImuSample
 
 FRAME_BYTES = 19
@@ -26,32 +26,16 @@ def _length(buffer: bytearray, position: int) -> int | None:
 
 
 @dataclass(slots=True)
-class RvcDecoder:
-    """Measurements out of a BNO08x's RVC stream; device ticks are the 8-bit index, 10 ms each.
+class RvcDecoder(FramedDecoder):
+    """Measurements out of a BNO08x's RVC stream; device ticks are the 8-bit index, 10 ms each."""
 
-    lost_messages: holes in the index. frames: how many came.
-    starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
-    """
-
-    frames: int = 0
-    starts: list[int] = field(default_factory=list)
-    framer: Framer = field(default_factory=lambda: Framer(_START, _length))
+    framer: Framer = field(default_factory=lambda: Framer(_START, _length), kw_only=True)
     _counter: SequenceCounter = field(default_factory=lambda: SequenceCounter(8))
 
     @property
     def lost_messages(self) -> int:
         """Messages missing in the index, which tells up to 127 in a row."""
         return self._counter.lost
-
-    @property
-    def bad_frames(self) -> int:
-        """Candidates for a frame that were none."""
-        return self.framer.bad_frames
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Bytes outside of frames."""
-        return self.framer.skipped_bytes
 
     def feed(self, data: bytes) -> list[ImuSample]:
         """The samples that `data` completes."""

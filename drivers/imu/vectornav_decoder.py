@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import reduce
 from operator import xor
 
-from drivers.framing import Framer, StepCounter
+from drivers.framing import FramedDecoder, Framer, StepCounter
 from drivers.samples import ImuSample, Vector
 
 SYNC = 0xFA
@@ -145,30 +145,17 @@ def _line_is_good(line: bytes | bytearray) -> bool:
 
 
 @dataclass(slots=True)
-class VectornavDecoder:
+class VectornavDecoder(FramedDecoder):
     """Measurements out of a VectorNav's stream, binary and ASCII.
 
     is_compensated: take acceleration and rate as corrected by the device's filter, where it sends both.
-    lost_messages: holes in the device time. frames: how many came, of any kind. replies: the latest lines that are no
-    measurement. starts: for each sample of the last `feed`, how many bytes had been fed before its first byte.
+    lost_messages: holes in the device time. replies: the latest lines that are no measurement.
     """
 
     is_compensated: bool = False
-    frames: int = 0
     replies: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_REPLIES))
-    starts: list[int] = field(default_factory=list)
     steps: StepCounter = field(default_factory=StepCounter)
-    framer: Framer = field(default_factory=lambda: Framer(_START, _length))
-
-    @property
-    def bad_frames(self) -> int:
-        """Candidates for a frame that were none."""
-        return self.framer.bad_frames
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Bytes outside of frames; the ends of lines count."""
-        return self.framer.skipped_bytes
+    framer: Framer = field(default_factory=lambda: Framer(_START, _length), kw_only=True)
 
     @property
     def lost_messages(self) -> int:

@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from drivers.framing import Framer
+from drivers.framing import FramedDecoder, Framer
 from drivers.samples import ImuSample, Vector
 
 FRAME_BYTES = 11
@@ -34,37 +34,24 @@ def _length(buffer: bytearray, position: int) -> int | None:
 
 
 @dataclass(slots=True)
-class WitmotionDecoder:
+class WitmotionDecoder(FramedDecoder):
     """Measurements out of a WitMotion stream; device ticks are milliseconds since 2000 of the device's own calendar.
 
     gravity_m_s2: what the device calls 1 g. magnetometer_ut: one step of the magnetometer in µT, which depends on the
     model and is nowhere told; without it there is no magnetic field. A group is over when the id which ended the last
-    two has come, else at the first frame of the next; `flush` is for the last one.
-    frames: how many came. starts: for each sample of the last `feed` or `flush`, how many bytes had been fed before it.
+    two has come, else at the first frame of the next; `flush` is for the last one, and sets `starts` as `feed` does.
     """
 
     gravity_m_s2: float = VENDOR_G_M_S2
     magnetometer_ut: float | None = None
-    frames: int = 0
     lost_messages: int = 0
-    starts: list[int] = field(default_factory=list)
-    framer: Framer = field(default_factory=lambda: Framer(_START, _length))
+    framer: Framer = field(default_factory=lambda: Framer(_START, _length), kw_only=True)
     _group: dict[int, bytes] = field(default_factory=dict)
     _start: int = 0
     _is_over: bool = False
     _last_id: int = 0
     _previous_end: int = 0
     _ender: int = 0
-
-    @property
-    def bad_frames(self) -> int:
-        """Candidates for a frame that were none."""
-        return self.framer.bad_frames
-
-    @property
-    def skipped_bytes(self) -> int:
-        """Bytes outside of frames."""
-        return self.framer.skipped_bytes
 
     def feed(self, data: bytes) -> list[ImuSample]:
         """The samples that `data` completes."""

@@ -19,6 +19,7 @@ class PtyDevice:
         self.answers = answers
         self.asked: list[bytes] = []
         self.heard = b""
+        self.sent = b""
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
@@ -40,6 +41,7 @@ class PtyDevice:
                     break
 
     def send(self, data: bytes) -> None:
+        self.sent += data
         os.write(self._master, data)
 
     def hang_up(self) -> None:

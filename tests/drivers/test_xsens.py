@@ -1,13 +1,10 @@
 """Xsens MTData2 decoder against captures decoded by others, and the driver over a pty."""
 
-import os
 import re
-import select
-import tty
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 
 import pytest
 from hypothesis import example, given, settings
@@ -235,47 +232,9 @@ ANSWERS = {
 }
 
 
-class PtyDevice:
-    """The far end of a pty: answers known requests, remembers what it sent and was asked."""
-
-    def __init__(self, answers: dict[bytes, bytes]) -> None:
-        self.answers = answers
-        self.asked: list[bytes] = []
-        self.sent = b""
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self._wake_read, self._wake_write = os.pipe()
-        self._thread = Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        heard = b""
-        while self._wake_read not in select.select([self._master, self._wake_read], [], [])[0]:
-            heard += os.read(self._master, 4096)
-            for request in self.answers:
-                if heard.endswith(request):
-                    self.asked.append(heard)
-                    heard = b""
-                    self.send(self.answers[request])
-
-    def send(self, data: bytes) -> None:
-        self.sent += data
-        os.write(self._master, data)
-
-    def hang_up(self) -> None:
-        if self._thread.is_alive():
-            os.write(self._wake_write, b"x")
-            self._thread.join()
-            for descriptor in (self._master, self._slave, self._wake_read, self._wake_write):
-                os.close(descriptor)
-
-
 @pytest.fixture
-def device() -> Iterator[PtyDevice]:
-    pty_device = PtyDevice(dict(ANSWERS))
-    yield pty_device
-    pty_device.hang_up()
+def device(pty_device):
+    return pty_device(dict(ANSWERS))
 
 
 def make_driver(port: str, **keys: object) -> XsensDriver:
@@ -311,7 +270,7 @@ def all_events(received: list[Received]) -> list[DeviceEvent]:
     return [event for part in received for event in part.events]
 
 
-def test_handshake_and_measurement(device: PtyDevice) -> None:
+def test_handshake_and_measurement(device) -> None:
     second = measurement(2, 50)
     device.answers[GO_TO_MEASUREMENT] += measurement(1, 25) + second[:10]
     driver = make_driver(device.port)
@@ -335,7 +294,7 @@ def test_handshake_and_measurement(device: PtyDevice) -> None:
     driver.close()
 
 
-def test_gap_event_from_the_packet_counter(device: PtyDevice) -> None:
+def test_gap_event_from_the_packet_counter(device) -> None:
     driver = make_driver(device.port)
     driver.connect()
     received, samples = read_until(
@@ -346,7 +305,7 @@ def test_gap_event_from_the_packet_counter(device: PtyDevice) -> None:
     driver.close()
 
 
-def test_hang_up_is_a_device_error(device: PtyDevice) -> None:
+def test_hang_up_is_a_device_error(device) -> None:
     driver = make_driver(device.port)
     driver.connect()
     reading = driver.read(Event())
@@ -358,7 +317,7 @@ def test_hang_up_is_a_device_error(device: PtyDevice) -> None:
     driver.close()
 
 
-def test_lost_request_is_sent_again(device: PtyDevice, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_request_is_sent_again(device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial_care, "ANSWER_S", 0.05)
     answer = device.answers.pop(GO_TO_CONFIG)
     device.answers[GO_TO_CONFIG * 2] = answer
@@ -368,7 +327,7 @@ def test_lost_request_is_sent_again(device: PtyDevice, monkeypatch: pytest.Monke
     driver.close()
 
 
-def test_no_answer_names_port_baud_and_message(device: PtyDevice, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_answer_names_port_baud_and_message(device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial_care, "ANSWER_S", 0.02)
     del device.answers[REQUEST_FIRMWARE]
     driver = make_driver(device.port)
@@ -381,13 +340,13 @@ def test_no_answer_names_port_baud_and_message(device: PtyDevice, monkeypatch: p
     driver.close()
 
 
-def test_refusal_is_told_in_words(device: PtyDevice) -> None:
+def test_refusal_is_told_in_words(device) -> None:
     device.answers[SET_OUTPUTS] = bytes.fromhex("FAFF4201219D")
     with pytest.raises(DeviceError, match=r"SetOutputConfiguration was refused .* parameter invalid"):
         make_driver(device.port).connect()
 
 
-def test_other_accepted_rates_are_warned_of(device: PtyDevice) -> None:
+def test_other_accepted_rates_are_warned_of(device) -> None:
     granted = bytes.fromhex("1020FFFF 1060FFFF 40200064 80200064 0810000A")
     device.answers[SET_OUTPUTS] = frame(0xC1, granted)
     driver = make_driver(device.port)
@@ -403,13 +362,13 @@ def test_other_accepted_rates_are_warned_of(device: PtyDevice) -> None:
     driver.close()
 
 
-def test_refused_acceleration_is_an_error(device: PtyDevice) -> None:
+def test_refused_acceleration_is_an_error(device) -> None:
     device.answers[SET_OUTPUTS] = frame(0xC1, bytes.fromhex("1020FFFF 1060FFFF 80200190"))
     with pytest.raises(DeviceError, match="did not accept acceleration at 400 Hz"):
         make_driver(device.port).connect()
 
 
-def test_unconfigured_device_is_listened_to(device: PtyDevice) -> None:
+def test_unconfigured_device_is_listened_to(device) -> None:
     driver = make_driver(device.port, configure=False, baud=9600)
     driver.connect()
     device.send(measurement(1, 25))  # waited for its reader for an unknown time
