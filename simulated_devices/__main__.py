@@ -20,7 +20,8 @@ import yaml
 from recorder.errors import ConfigError, RecorderError
 from simulated_devices.ideal import write_ideal
 from simulated_devices.replay import replay
-from simulated_devices.rig import DeviceDiedError, read_rig, simulated_rig
+from simulated_devices.rig import read_rig, simulated_rig
+from simulated_devices.simulation import DeviceDiedError
 
 EXIT_FAILED = 1
 EXIT_WRONG_USE = 2

@@ -41,7 +41,7 @@ from simulated_devices.replayed import (
     Script,
     SerialReplay,
 )
-from simulated_devices.rig import SimulatedDevice, Simulation, UdpPorts
+from simulated_devices.simulation import SimulatedDevice, Simulation, UdpPorts
 from simulated_devices.timing import SECOND_NS, WORLD_START_DELAY_NS, Int64Array, Stage
 
 log = logging.getLogger(__name__)

@@ -16,8 +16,9 @@ import pytest
 import yaml
 
 from recorder.errors import ConfigError
-from simulated_devices.rig import UdpPorts, calibration, read_rig, simulate_settings, simulated_rig
+from simulated_devices.rig import calibration, read_rig, simulate_settings, simulated_rig
 from simulated_devices.scene import stereo_pair
+from simulated_devices.simulation import UdpPorts
 
 DEADLINE_S = 10.0
 UDP_PORTS = ("lidar.msop_port", "lidar.difop_port", "mocap.port")
