@@ -38,7 +38,7 @@ from recorder.recording.manifest import (
     Manifest,
     Resync,
     hash_file,
-    read_manifest,
+    needed_manifest,
     sync_folder,
     write_atomically,
     write_manifest,
@@ -94,12 +94,7 @@ def resync(folder: Path, out: Path | None = None, progress: Progress = lambda do
 
 
 def _complete_manifest(folder: Path) -> Manifest:
-    try:
-        manifest = read_manifest(folder)
-    except FileNotFoundError:
-        raise StorageError(f"{folder}: not a recording of rigtape, there is no {MANIFEST_NAME} in it") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise StorageError(f"{folder / MANIFEST_NAME}: cannot be read: {error}") from error
+    manifest = needed_manifest(folder)
     if manifest.state == "recording":
         raise StorageError(f"{folder}: is not complete: it still runs, or broke off; only an ended take is refined")
     return manifest

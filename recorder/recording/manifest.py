@@ -10,6 +10,8 @@ from typing import Any, Literal
 
 import msgspec
 
+from recorder.errors import StorageError
+
 MANIFEST_NAME = "recording.json"
 EVENTS_NAME = "events.jsonl"
 NS_PER_S = 1_000_000_000
@@ -201,6 +203,16 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def read_manifest(folder: Path) -> Manifest:
     """recording.json of a folder. Raises OSError, msgspec.DecodeError or msgspec.ValidationError."""
     return msgspec.json.decode((folder / MANIFEST_NAME).read_bytes(), type=Manifest)
+
+
+def needed_manifest(folder: Path) -> Manifest:
+    """recording.json of a folder that must be a recording of rigtape. Raises StorageError."""
+    try:
+        return read_manifest(folder)
+    except FileNotFoundError:
+        raise StorageError(f"{folder}: not a recording of rigtape, there is no {MANIFEST_NAME} in it") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise StorageError(f"{folder / MANIFEST_NAME}: cannot be read: {error}") from error
 
 
 def write_atomically(path: Path, data: bytes) -> None:

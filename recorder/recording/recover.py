@@ -30,7 +30,7 @@ from recorder.recording.manifest import (
     MANIFEST_NAME,
     Manifest,
     camera_groups,
-    read_manifest,
+    needed_manifest,
     sync_folder,
     write_atomically,
     write_manifest,
@@ -61,12 +61,7 @@ def recover(folder: Path, progress: Progress = lambda done: None) -> Recovered:
 
     Raises StorageError: nothing to save, a take that still runs, no room, a disk that fails.
     """
-    try:
-        manifest = read_manifest(folder)
-    except FileNotFoundError:
-        raise StorageError(f"{folder}: not a recording of rigtape, there is no {MANIFEST_NAME} in it") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise StorageError(f"{folder / MANIFEST_NAME}: cannot be read: {error}") from error
+    manifest = needed_manifest(folder)
     if manifest.state != "recording":
         return Recovered(manifest, notes=[f"nothing to do: the recording is {manifest.state}"])
     lock = lock_folder(folder)

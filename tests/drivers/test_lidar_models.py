@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import lzma
 import struct
 import zlib
 from pathlib import Path
@@ -20,6 +19,7 @@ from drivers.lidar.points import PointDecoder
 from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder, packet_ticks
 from drivers.lidar.spinning_points import Setup, SpinningPointDecoder
 from drivers.samples import POINT_DTYPE, ScanSample
+from tests.drivers.lidar_packets import datagrams
 
 DATA = Path(__file__).parent.parent / "data" / "lidar"
 EXPECTED: dict[str, dict[str, dict[str, int | str]]] = json.loads((DATA / "expected.json").read_text())
@@ -28,16 +28,6 @@ MODEL_OF = {"m1": M1, "m2": M2, "m3": M3, "e1": E1, "airy": AIRY, "rs16": RS16}
 GOLDENS = [(name, variant) for name in EXPECTED for variant in EXPECTED[name]]
 COMPILED = [False, pytest.param(True, marks=pytest.mark.skipif(not fast.IS_AVAILABLE, reason="numba is not there"))]
 START_US = 1_700_000_000_000_000
-
-
-def datagrams(name: str) -> list[bytes]:
-    data = lzma.decompress((DATA / f"{name}.xz").read_bytes())
-    found, at = [], 0
-    while at < len(data):
-        (size,) = struct.unpack_from(">H", data, at)
-        found.append(data[at + 2 : at + 2 + size])
-        at += 2 + size
-    return found
 
 
 def model_of(name: str) -> SequencedModel:

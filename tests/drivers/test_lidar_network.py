@@ -1,9 +1,7 @@
 """Several lidars and their IMUs on one host: shared ports, multicast, models that are not those configured."""
 
 import errno
-import lzma
 import socket
-import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,20 +20,11 @@ from drivers.lidar.watches import BadPacketWatch, SetupWatch
 from drivers.links import UdpLink, UdpOptions
 from drivers.samples import ImuSample, Received, ScanSample
 from drivers.udp_batches import SLOTS
+from tests.drivers.lidar_packets import datagrams
 
 DATA = Path(__file__).parent.parent / "data" / "lidar"
 LIDAR, OTHER = "127.0.0.1", "127.0.0.2"
 PATIENCE_S = 10.0
-
-
-def datagrams(name: str) -> list[bytes]:
-    data = lzma.decompress((DATA / f"{name}.xz").read_bytes())
-    found, at = [], 0
-    while at < len(data):
-        (size,) = struct.unpack_from(">H", data, at)
-        found.append(data[at + 2 : at + 2 + size])
-        at += 2 + size
-    return found
 
 
 def free_ports(count: int) -> list[int]:
