@@ -191,7 +191,8 @@ class Playbill:
             keys.setdefault("fps", round(_rate_hz(shown), 3))
             ticks, arrival_ns = self._picture_times(name, shown.time_ns)
             script = functools.partial(self._picture_script, video, shown.picture[:, camera], ticks, arrival_ns)
-            self._add(PictureReplay(name, self._performance, video, script), keys)
+            own_name = name.replace(".", "_")  # a stream of an OAK is no name of a device
+            self._add(PictureReplay(own_name, self._performance, video, script), keys)
 
     def _picture_times(self, name: str, time_ns: Int64Array) -> tuple[Int64Array, Int64Array]:
         """The camera's own time and the arrival of each picture, in ns; the recording's where they were not kept."""

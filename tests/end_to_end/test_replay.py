@@ -11,6 +11,9 @@ import pytest
 
 import recorder
 from recorder.recording.model import Recording
+from recorder.rig import DEVICE_NAME
+from simulated_devices.replay import Playbill
+from simulated_devices.timing import Stage
 from tests.recorder.formats.conftest import write_recording
 
 RIGTAPE = [sys.executable, "-m", "recorder.cli"]
@@ -90,6 +93,16 @@ def test_what_has_no_tape_is_sent_in_protocols_that_carry_it(tmp_path: Path) -> 
     assert after.fixes.geodetic[-len(before.fixes) :] == pytest.approx(before.fixes.geodetic, abs=1e-4)
     assert after.fixes.quality.tolist() == before.fixes.quality.tolist()
     assert len(after.frames) == len(before.frames)
+
+
+def test_streams_of_an_oak_come_back_under_names_that_devices_may_have(tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "oak", lidar=False)
+    manifest = folder / "recording.json"
+    manifest.write_text(manifest.read_text().replace('"left"', '"oak.left"'))
+    bill = Playbill(folder, Stage(0), 1.0)
+    bill.ports.close()
+    assert "oak_left" in bill.document["devices"]
+    assert all(map(DEVICE_NAME.fullmatch, bill.document["devices"]))
 
 
 def test_what_cannot_be_replayed_is_refused(tmp_path: Path) -> None:
