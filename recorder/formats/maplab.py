@@ -26,8 +26,8 @@ from recorder.formats.importing import FILES_FOLDER
 from recorder.formats.maplab_landmarks import SIGMA_PX, Landmark, triangulate
 from recorder.formats.maplab_tracks import Keypoints, Track, Tracker
 from recorder.formats.maplab_vertices import Vertices, find_vertices
+from recorder.formats.quaternions import matrices
 from recorder.formats.report import Report
-from recorder.formats.rotations import matrices
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording
 from recorder.recording.series import Floats, Frames, Ints

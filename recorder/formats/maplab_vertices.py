@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recorder.formats.common import chosen_poses
+from recorder.formats.quaternions import conjugated, from_rotation_vector, multiplied, rotation_vector
 from recorder.formats.report import Report
-from recorder.formats.rotations import conjugated, from_rotation_vector, multiplied, rotation_vector
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.model import Recording
 from recorder.recording.series import Floats, Ints, Poses

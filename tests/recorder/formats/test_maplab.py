@@ -18,7 +18,7 @@ from recorder.errors import ConfigError
 from recorder.formats import FormatError
 from recorder.formats.maplab_landmarks import ERROR, FEW, PARALLAX, triangulate
 from recorder.formats.maplab_tracks import BORDER_PX, MAX_ROWS, Track, Tracker
-from recorder.formats.rotations import matrices
+from recorder.formats.quaternions import matrices
 from recorder.formats.running import export, import_
 from simulated_devices.ideal import write_ideal
 from simulated_devices.rig import read_rig
