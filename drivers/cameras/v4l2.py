@@ -32,6 +32,7 @@ VIDEO_CAPTURE, DEVICE_CAPS = 0x00000001, 0x80000000
 CAPTURE_BUFFERS = 1
 MAX_FORMATS = 64
 SYSTEM = Path("/")
+NON_BLOCKING = "+4"  # AVFMT_FLAG_NONBLOCK (libavformat/avformat.h): fflags has no name for it
 
 PixelFormat = Literal["mjpeg", "h264", "hevc", "yuyv422", "nv12", "yuv420p", "gray", "gray16le", "bgr24", "rgb24"]
 FORMAT_OF_FOURCC: dict[bytes, PixelFormat] = {
@@ -135,7 +136,7 @@ def stream_config(config: V4l2Config, pixel_format: str) -> StreamConfig:
         "input_format": pixel_format,
         "framerate": f"{config.fps:g}",
         "timestamps": "default",  # the kernel's own, on its monotonic clock
-        "fflags": "nonblock",
+        "fflags": NON_BLOCKING,
     }
     if config.width and config.height:
         options["video_size"] = f"{config.width}x{config.height}"

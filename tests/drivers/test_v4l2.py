@@ -141,7 +141,7 @@ def test_pictures_come_through_as_the_camera_made_them(
     assert opened[0]["format"] == "v4l2"
     options = {
         "input_format": "mjpeg" if format_ == "auto" else format_, "framerate": "30", "video_size": "64x48",
-        "timestamps": "default", "fflags": "nonblock",
+        "timestamps": "default", "fflags": "+4",
     }  # fmt: skip
     assert opened[0]["options"].items() >= options.items()
     driver.close()
@@ -177,9 +177,19 @@ def test_a_format_that_the_camera_does_not_have() -> None:
 def test_options_of_the_rig_come_last() -> None:
     made = stream_config(config(fps=59.94, options={"framerate": "60", "ts": "abs"}), "mjpeg")
     assert made.options == {
-        "input_format": "mjpeg", "framerate": "60", "timestamps": "default", "fflags": "nonblock", "ts": "abs"
+        "input_format": "mjpeg", "framerate": "60", "timestamps": "default", "fflags": "+4", "ts": "abs"
     }  # fmt: skip
     assert (made.format, made.url, made.fps) == ("v4l2", "/dev/video0", 59.94)
+
+
+def test_ffmpeg_takes_the_options_and_opens_without_blocking(tmp_path: Path) -> None:
+    """A file is no camera, which FFmpeg notices after the options; a test source takes the flag as a camera does."""
+    (tmp_path / "file").write_bytes(b"")
+    made = stream_config(config(width=64, height=48), "mjpeg")
+    with pytest.raises(OSError, match="Inappropriate ioctl"):
+        av.open(str(tmp_path / "file"), format="v4l2", options=made.options)
+    with av.open("testsrc=size=64x48", format="lavfi", options={"fflags": made.options["fflags"]}) as source:
+        assert source.flags & av.container.Flags.non_block.value
 
 
 def test_a_node_that_gives_no_pictures(camera: tuple[str, Kernel]) -> None:
