@@ -88,7 +88,7 @@ class StreamDriver:
         self._garbage = GarbageWatch(self)
         self._container: InputContainer | None = None
         self._wait_for_keyframe = True
-        self._rhythm = _Rhythm(config.fps)
+        self._rhythm = Rhythm(config.fps)
         self._last_dts: int | None = None
 
     @property
@@ -279,7 +279,7 @@ class _HeadersInBand:
 
 
 @dataclass(slots=True)
-class _Rhythm:
+class Rhythm:
     """Tells from the time between pictures how many are missing, also across a new connection.
 
     fps: what is configured; it counts until enough pictures have come to tell the true rate, for a wrong `fps` must

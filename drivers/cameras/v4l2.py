@@ -5,6 +5,7 @@ monotonic clock, at the moment that the camera's driver chose (of UVC cameras th
 `latency_s` takes off what lies between that and the middle of the exposure.
 
 A camera is opened without blocking, because the kernel waits for ever for the next picture of one that has stalled.
+What FFmpeg cannot open, though it is there and free, is read through OpenCV.
 ioctls: linux/videodev2.h, VIDIOC_QUERYCAP and VIDIOC_ENUM_FMT.
 """
 
@@ -22,6 +23,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers.cameras.stream import USUAL_FPS, StreamConfig, StreamDriver
+from drivers.cameras.v4l2_opencv import OpenCvCamera
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.samples import Received
 
@@ -31,6 +33,7 @@ FORMAT = struct.Struct("III32sI16x")  # index, type, flags, description, fourcc
 VIDEO_CAPTURE, DEVICE_CAPS = 0x00000001, 0x80000000
 CAPTURE_BUFFERS = 1
 MAX_FORMATS = 64
+NOT_TO_BE_HAD = frozenset({errno.EACCES, errno.EBUSY, errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EPERM})
 SYSTEM = Path("/")
 NON_BLOCKING = "+4"  # AVFMT_FLAG_NONBLOCK (libavformat/avformat.h): fflags has no name for it
 
@@ -162,25 +165,27 @@ class V4l2Driver:
         """Nothing is opened yet."""
         self._name = name
         self._config = config
-        self._stream = StreamDriver(name, stream_config(config, config.format))
+        self._stream: StreamDriver | OpenCvCamera = StreamDriver(name, stream_config(config, config.format))
+        self.streams: tuple[StreamSpec, ...] = self._stream.streams
         self.identity: dict[str, str] = {}
-
-    @property
-    def streams(self) -> tuple[StreamSpec, ...]:
-        """Pictures at the configured rate."""
-        return self._stream.streams
 
     def connect(self) -> None:
         """Open the camera in the best format it has. Raises DeviceError: absent, in use, a format it does not have."""
         capability = query(self._config.path)
         pixel_format = choose_format(self._config, capability)
-        self._stream = StreamDriver(self._name, stream_config(self._config, pixel_format))
+        settings = stream_config(self._config, pixel_format)
         try:
-            self._stream.connect()
+            self._stream = ffmpeg = StreamDriver(self._name, settings)
+            ffmpeg.connect()
         except DeviceError as error:
-            if errno.errorcode[errno.EBUSY] in str(error):
+            number = getattr(error.__cause__, "errno", None)
+            if number == errno.EBUSY:
                 raise DeviceError(f"{self._config.path}: another program uses the camera; close it") from error
-            raise
+            if error.__cause__ is None or number in NOT_TO_BE_HAD:  # without a cause: the video is not as it must be
+                raise
+            fourccs = tuple(code for code, name in FORMAT_OF_FOURCC.items() if name == pixel_format)
+            self._stream = opencv = OpenCvCamera(settings, str(error))
+            opencv.connect(pixel_format, fourccs)
         self.identity = {
             "camera": capability.card, "bus": capability.bus, "path": self._config.path, "format": pixel_format
         }  # fmt: skip
