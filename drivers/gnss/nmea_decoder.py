@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 from msgspec import Struct
@@ -29,7 +30,10 @@ MAX_HDOP = 99.0  # receivers send 99.9 for "unknown"
 DAY_NS = 86_400 * NS_PER_S
 ROLLOVER_NS = 1024 * 7 * DAY_NS
 
-_LATITUDE_LONGITUDE = re.compile(rb"(\d{1,2})(\d\d(?:\.(\d*))?),([NS]),(\d{1,3})(\d\d(?:\.\d*)?),([EW])")
+_LATITUDE_LONGITUDE = re.compile(
+    rb"(\d{1,2})([0-5]\d(?:\.(\d*))?),([NS]),"  # degrees, minutes with their decimals
+    rb"(\d{1,3})([0-5]\d(?:\.\d*)?),([EW])"
+)
 
 Source = Literal["gst", "pubx", "dop", "none"]
 
@@ -120,11 +124,12 @@ class NmeaDecoder:
     scanner: SentenceScanner = field(default_factory=SentenceScanner)
     _epoch: _Epoch | None = None
     _last_utc_ns: int | None = None
+    _date_ns: int | None = None
     _ender: tuple[bytes, int] | None = None
     _previous_tail: tuple[bytes, int] | None = None
     _gsa: tuple[int, bytes] = (0, b"")
     _time_text: bytes | None = None
-    _time_ns: int | None = None
+    _epoch_of_text: _Epoch | None = None
 
     @property
     def bad_frames(self) -> int:
@@ -141,10 +146,28 @@ class NmeaDecoder:
         fixes: list[FixSample] = []
         sentences = self.scanner.feed(data)
         self.sentences += len(sentences)
-        kind_of = _KINDS.get
         for offset, body in sentences:
-            if (kind := kind_of(body[2:6])) is not None:
-                self._take(offset, body, kind, fixes)
+            kind = _KINDS.get(body[2:6])
+            if kind is None:
+                continue
+            time_field, gather, is_of_fix = kind
+            if time_field == NO_TIME:
+                if self._epoch is not None:
+                    self._gsa = (self._epoch.day_ns, body)
+                continue
+            fields = body.split(b",")
+            if time_field >= len(fields):
+                continue
+            if fields[time_field] != self._time_text:
+                self._time_text = fields[time_field]
+                self._epoch_of_text = self._epoch_at(time_of_day_ns(self._time_text), offset, fixes)
+            epoch = self._epoch_of_text
+            if epoch is None:
+                continue
+            if gather is not None:
+                gather(epoch, fields, self.rules)
+            if is_of_fix:
+                self._count(epoch, fields[0], fixes)
         return fixes
 
     def flush(self) -> list[FixSample]:
@@ -153,35 +176,23 @@ class NmeaDecoder:
         self._close(fixes)
         return fixes
 
-    def _take(self, offset: int, body: bytes, kind: "_Kind", fixes: list[FixSample]) -> None:
-        time_field, gather, is_of_fix = kind
-        if time_field == NO_TIME:
-            if self._epoch is not None:
-                self._gsa = (self._epoch.day_ns, body)
-            return
-        fields = body.split(b",")
-        if time_field >= len(fields):
-            return
-        if fields[time_field] != self._time_text:
-            self._time_text = fields[time_field]
-            self._time_ns = time_of_day_ns(self._time_text)
-        if self._time_ns is None:
-            return
-        epoch = self._epoch
-        if epoch is None or epoch.day_ns != self._time_ns:
+    def _epoch_at(self, day_ns: int | None, offset: int, fixes: list[FixSample]) -> _Epoch | None:
+        """The open epoch if it is of this time of day, else a new one; None without a time."""
+        if day_ns is None:
+            return None
+        if self._epoch is None or self._epoch.day_ns != day_ns:
             self._close(fixes)
             self._learn()
-            epoch = self._epoch = _Epoch(self._time_ns, offset)
-        if gather is not None:
-            gather(epoch, fields, self.rules)
-        if not is_of_fix:
-            return
-        address = fields[0]
+            self._epoch = _Epoch(day_ns, offset)
+        return self._epoch
+
+    def _count(self, epoch: _Epoch, address: bytes, fixes: list[FixSample]) -> None:
+        """A sentence of the fix has come; with the learned last one of the cycle the epoch is over."""
         count = epoch.seen[address] = epoch.seen.get(address, 0) + 1
         epoch.tail = address
         if epoch.is_over:
             epoch.is_incomplete = True
-        elif self._ender is not None and self._ender == (address, count):
+        elif (address, count) == self._ender:
             self._close(fixes)
 
     def _learn(self) -> None:
@@ -247,10 +258,11 @@ class NmeaDecoder:
     def _utc_ns(self, epoch: _Epoch) -> int:
         """UTC of an epoch: with the date it was sent with, else on the day that brings it nearest to the last one."""
         if epoch.date_ns is not None:
-            utc_ns = epoch.date_ns + epoch.day_ns
-            # Receivers jump back only; a host without a set clock (1970) must not make a good date worse.
-            self.rollovers = max(0, _rounded(self.reference_utc_ns - utc_ns, ROLLOVER_NS))
-            return utc_ns + self.rollovers * ROLLOVER_NS
+            if epoch.date_ns != self._date_ns:
+                self._date_ns = epoch.date_ns
+                # Receivers jump back only; a host without a set clock (1970) must not make a good date worse.
+                self.rollovers = max(0, _rounded(self.reference_utc_ns - epoch.date_ns, ROLLOVER_NS))
+            return epoch.date_ns + self.rollovers * ROLLOVER_NS + epoch.day_ns
         near_ns = self.reference_utc_ns if self._last_utc_ns is None else self._last_utc_ns
         return epoch.day_ns + _rounded(near_ns - epoch.day_ns, DAY_NS) * DAY_NS
 
@@ -326,6 +338,7 @@ def _gather_zda(epoch: _Epoch, fields: list[bytes], rules: FixRules) -> None:
 NO_TIME = 0
 
 
+@lru_cache(maxsize=4)  # one GSA serves the fixes of two seconds
 def _vertical_dilution(gsa: bytes) -> float | None:
     commas = gsa.count(b",")
     if commas not in (17, 18):  # NMEA 4.1 adds the system
@@ -374,9 +387,9 @@ def _position(
     if match is None:
         return None
     degrees, minutes, decimals, north_south, east_degrees, east_minutes, east_west = match.groups()
-    latitude_deg = int(degrees) + float(minutes) / 60
-    longitude_deg = int(east_degrees) + float(east_minutes) / 60
-    if latitude_deg > 90 or longitude_deg > 180 or minutes >= b"60" or east_minutes >= b"60":
+    latitude_deg = float(degrees) + float(minutes) / 60
+    longitude_deg = float(east_degrees) + float(east_minutes) / 60
+    if latitude_deg > 90 or longitude_deg > 180:
         return None
     return _Position(
         fields[0].startswith(b"GN"),
