@@ -200,17 +200,27 @@ def whole_way_us(frames: list[bytes]) -> float:
 
 
 def fields_of_a_fix(pynmea2: Any, line: str) -> tuple[object, ...]:
+    """What the decoder reads of a sentence, through pynmea2; what that leaves as text is made a number."""
     message = pynmea2.parse(line, check=True)
     match message.sentence_type:
         case "GGA":
-            quality = message.gps_qual, message.num_sats, message.horizontal_dil, message.age_gps_data
-            return message.timestamp, message.latitude, message.longitude, message.altitude, message.geo_sep, *quality
+            place = message.latitude, message.longitude, message.altitude, as_float(message.geo_sep)
+            quality = message.gps_qual, int(message.num_sats or 0), as_float(message.horizontal_dil)
+            return message.timestamp, *place, *quality, as_float(message.age_gps_data)
         case "RMC":
             return message.timestamp, message.status, message.datestamp
         case "GST":
             sigmas = message.std_dev_latitude, message.std_dev_longitude, message.std_dev_altitude
             return message.timestamp, *sigmas
+        case "ZDA":
+            return message.timestamp, message.day, message.month, message.year
+        case "GLL" | "GBS" | "GRS":
+            return (message.timestamp,)
     return ()
+
+
+def as_float(text: str) -> float | None:
+    return float(text) if text else None
 
 
 def nmea_rates_hz(lines: int, repetitions: int) -> dict[str, float]:

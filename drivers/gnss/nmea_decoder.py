@@ -125,6 +125,7 @@ class NmeaDecoder:
     _epoch: _Epoch | None = None
     _last_utc_ns: int | None = None
     _date_ns: int | None = None
+    _midnight_utc_ns: int = 0
     _ender: tuple[bytes, int] | None = None
     _previous_tail: tuple[bytes, int] | None = None
     _gsa: tuple[int, bytes] = (0, b"")
@@ -262,7 +263,8 @@ class NmeaDecoder:
                 self._date_ns = epoch.date_ns
                 # Receivers jump back only; a host without a set clock (1970) must not make a good date worse.
                 self.rollovers = max(0, _rounded(self.reference_utc_ns - epoch.date_ns, ROLLOVER_NS))
-            return epoch.date_ns + self.rollovers * ROLLOVER_NS + epoch.day_ns
+                self._midnight_utc_ns = epoch.date_ns + self.rollovers * ROLLOVER_NS
+            return self._midnight_utc_ns + epoch.day_ns
         near_ns = self.reference_utc_ns if self._last_utc_ns is None else self._last_utc_ns
         return epoch.day_ns + _rounded(near_ns - epoch.day_ns, DAY_NS) * DAY_NS
 

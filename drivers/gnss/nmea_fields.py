@@ -29,18 +29,26 @@ def integer(text: bytes) -> int | None:
 
 def time_of_day_ns(text: bytes) -> int | None:
     """Of hhmmss and any number of decimals."""
-    second_ns, decimals_ns = _second_of_day_ns(text[:6]), _decimals_ns(text[6:])
-    return None if second_ns is None or decimals_ns is None else second_ns + decimals_ns
+    minute_ns, second_ns, decimals_ns = _minute_of_day_ns(text[:4]), _second_ns(text[4:6]), _decimals_ns(text[6:])
+    if minute_ns is None or second_ns is None or decimals_ns is None:
+        return None
+    return minute_ns + second_ns + decimals_ns
 
 
 @lru_cache(maxsize=8)
-def _second_of_day_ns(text: bytes) -> int | None:
-    if len(text) != 6 or not text.isdigit():
+def _minute_of_day_ns(text: bytes) -> int | None:
+    if len(text) != 4 or not text.isdigit():
         return None
-    hour, minute, second = int(text[:2]), int(text[2:4]), int(text[4:])
-    if hour > 23 or minute > 59 or second > 60:  # a leap second is 23:59:60, the same instant as 0:00 of the next day
+    hour, minute = int(text[:2]), int(text[2:])
+    return None if hour > 23 or minute > 59 else (hour * 60 + minute) * 60 * NS_PER_S
+
+
+@lru_cache(maxsize=64)
+def _second_ns(text: bytes) -> int | None:
+    if len(text) != 2 or not text.isdigit():
         return None
-    return (hour * 3600 + minute * 60 + second) * NS_PER_S
+    second = int(text)  # a leap second is 23:59:60, the same instant as 0:00 of the next day
+    return None if second > 60 else second * NS_PER_S
 
 
 @lru_cache(maxsize=64)
