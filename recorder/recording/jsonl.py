@@ -13,6 +13,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,7 @@ def imu_lines(time_ns: int, sample: ImuSample) -> list[tuple[str, bytes]]:
         ("imuTemperature", None if sample.temperature_k is None else (sample.temperature_k,)),
     )
     present = [SensorValues(kind, values) for kind, values in sensors if values is not None]
-    if not all(map(math.isfinite, (value for sensor in present for value in sensor.values))):
+    if not all(map(math.isfinite, chain.from_iterable([sensor.values for sensor in present]))):
         return []
     return [(sensor.type, encode_json(SensorLine(sensor, time_s))) for sensor in present]
 
@@ -221,16 +222,18 @@ class LineWriter:
             time.sleep(FLUSH_S / 2)  # collects lines: one write for many
 
     def _write_ready(self, waiting: deque[tuple[Pending, bool]]) -> None:
-        while waiting:
-            pending, late = waiting[0]
-            if not _is_ready(pending):
-                return
-            waiting.popleft()
+        lines: list[bytes] = []
+        late_lines: list[bytes] = []
+        while waiting and _is_ready(waiting[0][0]):
+            pending, late = waiting.popleft()
             line = self._finished(pending)
-            if line is None:
-                continue
-            (self._open_late_file() if late else self._file).write(line + b"\n")
-            self.written_lines += 1
+            if line is not None:
+                (late_lines if late else lines).append(line + b"\n")
+        if lines:
+            self._file.write(b"".join(lines))
+        if late_lines:
+            self._open_late_file().write(b"".join(late_lines))
+        self.written_lines += len(lines) + len(late_lines)
 
     def _finished(self, pending: Pending) -> bytes | None:
         if isinstance(pending, bytes):

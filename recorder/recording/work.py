@@ -73,9 +73,10 @@ class ByteQueue(Generic[T]):
             self._append(item, size)
 
     def _append(self, item: T, size: int) -> None:
+        if not self._items:  # else the consumer does not wait
+            self._changed.notify_all()
         self._items.append((item, size))
         self._bytes += size
-        self._changed.notify_all()
 
     def get_all(self, timeout_s: float) -> list[T]:
         """All that waits; empty after `timeout_s` without any."""
