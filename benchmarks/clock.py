@@ -289,7 +289,7 @@ def cost(scale: float) -> None:
                 spent, refits = spent + time.process_time() - start, refits + 1
         sampled_us = (time.process_time() - begin - spent) / trace.ticks.size * 1e6
         share = spent / ((trace.arrival_ns[-1] - trace.arrival_ns[0]) / 1e9)
-        kept = len(pickle.dumps(clock.__dict__["_estimator"])) // 1000
+        kept = len(pickle.dumps(clock.__dict__["_streams"])) // 1000
         print(
             f"{name}: map {sampled_us:.2f} us a sample; {refits} refits of {1e3 * spent / refits:.1f} ms, "
             f"{100 * share:.2f} % of a core; {kept} kB kept"

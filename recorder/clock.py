@@ -67,16 +67,19 @@ class _Lateness:
 class ClockStream:
     """One stream of a device clock: its tick unit, its unwrapping, its order.
 
-    tick_hz: ticks per second of the stream's counter; wrap_bits: its width, 0 if it does not wrap.
+    tick_hz: ticks per second of the stream's counter; wrap_bits: its width, 0 if it does not wrap. family: all streams
+    of the clock. One that restarts while others run on goes on with an estimator of its own.
     """
 
-    def __init__(self, estimator: Estimator, tick_hz: float, wrap_bits: int = 0):
+    def __init__(self, estimator: Estimator, tick_hz: float, wrap_bits: int, family: list[ClockStream]):
         if not (tick_hz > 0 and math.isfinite(tick_hz)):
             raise ValueError(f"tick_hz must be a positive number, not {tick_hz}")
         if wrap_bits < 0:
             raise ValueError(f"wrap_bits must not be negative, not {wrap_bits}")
         ns_per_tick = S / Fraction(tick_hz).limit_denominator(1_000_000)
-        self._estimator = estimator
+        family.append(self)
+        self._family = family
+        self.estimator = estimator
         self._num, self._den = ns_per_tick.numerator, ns_per_tick.denominator
         self._modulus = 1 << wrap_bits if wrap_bits else 0
         self._wrap_ns = self._ns(self._modulus)
@@ -103,13 +106,13 @@ class ClockStream:
     def map(self, ticks: int, arrival_ns: int) -> int:
         """Host time of one event: learn from it, then answer."""
         device_ns = self.observe(ticks, arrival_ns)
-        stamp_ns = max(self._estimator.host_ns(device_ns), self._stamp_ns)
+        stamp_ns = max(self.estimator.host_ns(device_ns), self._stamp_ns)
         self._stamp_ns = min(stamp_ns, arrival_ns)
         return self._stamp_ns
 
     def observe(self, ticks: int, arrival_ns: int) -> int:
         """Learn from one sample; its device time on the map's axis, int ns."""
-        estimator = self._estimator
+        estimator = self.estimator
         step = ticks - self._ticks
         if self._modulus:
             step %= self._modulus
@@ -128,9 +131,19 @@ class ClockStream:
         estimator.feed(x, y, rest)
         return device_ns if self._epoch == estimator.epoch else self._remember(unwrapped, arrival_ns)
 
+    @overload
+    def host_ns(self, device_ns: int) -> int: ...
+    @overload
+    def host_ns(self, device_ns: Ints) -> Ints: ...
+    def host_ns(self, device_ns: int | Ints) -> int | Ints:
+        """Host time of device times on the map's axis by what is known now; not held below any arrival."""
+        if isinstance(device_ns, np.ndarray):
+            return self.estimator.host_many(device_ns)
+        return self.estimator.host_ns(device_ns)
+
     def observe_many(self, ticks: Ints, arrival_ns: Ints) -> Ints:
         """`observe` for a batch in order of arrival."""
-        if ticks.size >= MIN_BATCH and self._epoch == self._estimator.epoch:
+        if ticks.size >= MIN_BATCH and self._epoch == self.estimator.epoch:
             device_ns = self._observe_plain(ticks, arrival_ns)
             if device_ns is not None:
                 return device_ns
@@ -139,7 +152,7 @@ class ClockStream:
 
     def _observe_plain(self, ticks: Ints, arrival_ns: Ints) -> Ints | None:
         """The whole batch at once if nothing in it is out of the ordinary."""
-        estimator = self._estimator
+        estimator = self.estimator
         if self._irregular or int(np.abs(ticks).max()) > FAR // self._num:
             return None
         step = np.diff(ticks, prepend=self._ticks % self._modulus if self._modulus else self._ticks)
@@ -169,7 +182,7 @@ class ClockStream:
     def unwrap(self, ticks: Ints) -> Ints: ...
     def unwrap(self, ticks: int | Ints) -> int | Ints:
         """Device time of ticks near the last observed ones, without learning from them."""
-        zero_ns = self._own_zero_ns + self._estimator.zero_ns
+        zero_ns = self._own_zero_ns + self.estimator.zero_ns
         if isinstance(ticks, np.ndarray):
             if self._modulus and self._epoch >= 0:
                 half = self._modulus // 2
@@ -192,7 +205,7 @@ class ClockStream:
         """The first sample of a stream or epoch, duplicates, disorder, stalls, restarts, garbage."""
         if self._modulus:
             ticks %= self._modulus  # a counter shows no more; higher bits are garbage
-        estimator = self._estimator
+        estimator = self.estimator
         if not estimator.started and abs(self._ns(ticks)) < FAR:
             estimator.start(self._ns(ticks), arrival_ns)
         unwrapped = self._choose_wrap(ticks, arrival_ns) if estimator.started else ticks
@@ -208,7 +221,10 @@ class ClockStream:
         x = device_ns - estimator.anchor_device
         rest = arrival_ns - estimator.anchor_host - x - estimator.fit.at(x)
         far_off = self._reconnected and abs(rest) > RECONNECTED_NS + estimator.tolerance_ns()
-        if far_off or rest < -estimator.early_limit_ns(x) or (same_epoch and step_ns <= -STEP_BACK_NS):
+        impossible = far_off or rest < -estimator.early_limit_ns(x) or (same_epoch and step_ns <= -STEP_BACK_NS)
+        if (impossible or rest > self._late_ns) and self._follow(ticks, arrival_ns):
+            return self._observe_unsure(ticks, arrival_ns)
+        if impossible:
             return self._suspect(ticks, arrival_ns)
         self._reconnected = False
         estimator.counts.rejected += len(self._suspects)
@@ -223,7 +239,7 @@ class ClockStream:
 
     def _accept(self, unwrapped: int, arrival_ns: int) -> int:
         """Learn from a sample that is in order again."""
-        estimator = self._estimator
+        estimator = self.estimator
         if self._modulus and self._epoch == estimator.epoch:
             estimator.counts.wraps += abs(unwrapped // self._modulus - self._ticks // self._modulus)
         device_ns = self._remember(unwrapped, arrival_ns)
@@ -237,7 +253,7 @@ class ClockStream:
 
         A pause also begins with silence of its own length, in which the device counted nothing.
         """
-        estimator = self._estimator
+        estimator = self.estimator
         estimator.counts.late += 1
         silence_ns, step_ns = arrival_ns - self._arrival_ns, self._axis_ns(unwrapped) - self._device_ns
         device_ns = self._remember(unwrapped, arrival_ns)
@@ -252,12 +268,36 @@ class ClockStream:
             return device_ns
         self._lateness = None
         estimator.counts.resets += 1
-        estimator.begin_epoch(round(min(lateness.lows)))
+        self._begin_epoch(round(min(lateness.lows)))
         return self._accept(unwrapped, arrival_ns)
+
+    def _begin_epoch(self, shift_ns: int) -> None:
+        """The stream's counter jumped; so may those of the other streams, which then follow by `_follow`."""
+        if any(stream is not self and stream.estimator is self.estimator for stream in self._heard()):
+            self.estimator = self.estimator.fork()
+        self.estimator.begin_epoch(shift_ns)
+
+    def _heard(self) -> list[ClockStream]:
+        return [stream for stream in self._family if stream._epoch >= 0]
+
+    def _follow(self, ticks: int, arrival_ns: int) -> bool:
+        """Whether a sample that is off its line lies on that of a stream that restarted since: then go there."""
+        own = self.estimator
+        for other in dict.fromkeys(stream.estimator for stream in self._heard()):
+            if other is own or (self._epoch >= 0 and other.epoch < own.epoch):
+                continue
+            self.estimator = other
+            x = self._axis_ns(self._choose_wrap(ticks, arrival_ns)) - other.anchor_device
+            rest = arrival_ns - other.anchor_host - x - other.fit.at(x)
+            if -other.early_limit_ns(x) < rest < min(RECONNECTED_NS + other.tolerance_ns(), self._late_ns):
+                self._suspects.clear()
+                return True
+        self.estimator = own
+        return False
 
     def _suspect(self, ticks: int, arrival_ns: int) -> int:
         """Earlier than possible, or far back: garbage, or the clock has restarted if the next ones agree."""
-        estimator = self._estimator
+        estimator = self.estimator
         if self._suspects:
             step = ticks - self._suspects[-1][0]
             step_ns = self._ns(step % self._modulus if self._modulus else step)
@@ -277,7 +317,7 @@ class ClockStream:
             self._own_zero_ns += shift_ns
         else:
             estimator.counts.resets += 1
-            estimator.begin_epoch(shift_ns)
+            self._begin_epoch(shift_ns)
         self._lateness, self._reconnected = None, False
         self._ticks, self._epoch = first_ticks, -1
         for tick, arrival in suspects:
@@ -286,7 +326,7 @@ class ClockStream:
         return device_ns
 
     def _remember(self, unwrapped: int, arrival_ns: int) -> int:
-        self._epoch = self._estimator.epoch
+        self._epoch = self.estimator.epoch
         self._ticks, self._arrival_ns = unwrapped, arrival_ns
         self._device_ns = self._axis_ns(unwrapped)
         return self._device_ns
@@ -298,7 +338,7 @@ class ClockStream:
 
         A sample cannot arrive before its event: of the possible times the latest that is not too early is taken.
         """
-        estimator = self._estimator
+        estimator = self.estimator
         if not self._modulus:
             return ticks
         if self._epoch == estimator.epoch and arrival_ns - self._arrival_ns < self._wrap_ns // 2:
@@ -324,7 +364,7 @@ class ClockStream:
         return ns
 
     def _axis_ns(self, unwrapped: int) -> int:
-        return self._ns(unwrapped) + self._own_zero_ns + self._estimator.zero_ns
+        return self._ns(unwrapped) + self._own_zero_ns + self.estimator.zero_ns
 
 
 class ClockMap:
@@ -349,14 +389,25 @@ class ClockMap:
         use_grid: bool = True,
     ):
         prior = SlopePrior(1 / (1 + prior_skew_ppm * PPM) - 1, max(prior_sigma_ppm, 1e-3) * PPM)
-        self._estimator = Estimator(prior, inline_refit, level, use_grid)
-        self._stream = ClockStream(self._estimator, tick_hz, wrap_bits)
+        estimator = Estimator(prior, inline_refit, level, use_grid)
+        self._counts = estimator.counts
+        self._streams: list[ClockStream] = []
+        self._stream = ClockStream(estimator, tick_hz, wrap_bits, self._streams)
         self.map = self._stream.map
         self._two_way: list[tuple[int, int]] = []  # round trip, stamp minus its middle
 
     def stream(self, tick_hz: float, wrap_bits: int = 0) -> ClockStream:
         """Another stream of the same device clock, with ticks of its own."""
-        return ClockStream(self._estimator, tick_hz, wrap_bits)
+        return ClockStream(self._estimator, tick_hz, wrap_bits, self._streams)
+
+    def _estimators(self) -> list[Estimator]:
+        """One as a rule; more when streams restarted while others ran on."""
+        return list(dict.fromkeys(stream.estimator for stream in self._streams))
+
+    @property
+    def _estimator(self) -> Estimator:
+        """The one that began an epoch last."""
+        return max(self._estimators(), key=lambda estimator: estimator.epoch)
 
     @overload
     def host_ns(self, device_ns: int) -> int: ...
@@ -364,9 +415,8 @@ class ClockMap:
     def host_ns(self, device_ns: Ints) -> Ints: ...
     def host_ns(self, device_ns: int | Ints) -> int | Ints:
         """Host time of device times on the map's axis by what is known now; not held below any arrival."""
-        if isinstance(device_ns, np.ndarray):
-            return self._estimator.host_many(device_ns)
-        return self._estimator.host_ns(device_ns)
+        estimator = self._estimator
+        return estimator.host_many(device_ns) if isinstance(device_ns, np.ndarray) else estimator.host_ns(device_ns)
 
     def observe_two_way(self, ticks: int, sent_ns: int, received_ns: int, stream: ClockStream | None = None) -> None:
         """A query sent and its answer received with the device's ticks in between: bounds from both sides.
@@ -374,10 +424,11 @@ class ClockMap:
         They tell the least delay of the link (`floor_ns`), and stamps move earlier by it, at the usual rate. The pairs
         with the shortest round trips count, like the best probes of NTP (RFC 5905, section 10). stream: whose ticks.
         """
-        estimator = self._estimator
+        stream = stream or self._stream
+        estimator = stream.estimator
         if not estimator.started or received_ns < sent_ns:
             return
-        x = (stream or self._stream).unwrap(ticks) - estimator.anchor_device
+        x = stream.unwrap(ticks) - estimator.anchor_device
         if abs(x) >= FAR:
             return
         late_ns = estimator.anchor_host + x + round(estimator.fit.at(x)) - (sent_ns + received_ns) // 2
@@ -399,27 +450,34 @@ class ClockMap:
     def host_suspended(self, duration_ns: int) -> None:
         """The host slept: its monotonic clock stood still for `duration_ns` while the device ran on."""
         if self._estimator.started and duration_ns > 0:
-            self._estimator.counts.suspends += 1
-            self._estimator.begin_epoch(-duration_ns)
+            self._counts.suspends += 1
             self._two_way = []
+            for estimator in self._estimators():
+                estimator.begin_epoch(-duration_ns)
 
     @property
     def refit_due(self) -> bool:
         """Enough has come in for `refit` to be worth calling."""
-        return self._estimator.refit_due
+        for stream in self._streams:  # no generator: asked for each sample
+            if stream.estimator.refit_due:
+                return True
+        return False
 
     def refit(self) -> None:
         """Work out the line anew; a few ms, in any thread."""
-        self._estimator.refit()
+        for estimator in self._estimators():
+            if estimator.refit_due:
+                estimator.refit()
 
     def settle(self) -> None:
         """No stamp of this epoch has been used yet: let the newest line hold for all of it, without slewing."""
-        self._estimator.settle()
+        for estimator in self._estimators():
+            estimator.settle()
 
     @property
     def epoch(self) -> int:
         """Sync epoch, from 0; counts up when the clocks jumped against each other."""
-        return self._estimator.epoch
+        return self._counts.epochs
 
     @property
     def uncertainty_ns(self) -> float:
@@ -430,47 +488,47 @@ class ClockMap:
     @property
     def skew_ppm(self) -> float:
         """How much faster the device clock runs than the host's."""
-        return (1 / (1 + self._estimator.fit.slope) - 1) / PPM
+        return float(1 / (1 + self._estimator.fit.slope) - 1) / PPM
 
     @property
     def skew_sigma_ppm(self) -> float:
         """One sigma of `skew_ppm`."""
-        return self._estimator.fit.sd_slope / PPM
+        return float(self._estimator.fit.sd_slope) / PPM
 
     @property
     def duplicates(self) -> int:
         """Samples with the ticks of the one before."""
-        return self._estimator.counts.duplicates
+        return self._counts.duplicates
 
     @property
     def reordered(self) -> int:
         """Samples that came after a younger one."""
-        return self._estimator.counts.reordered
+        return self._counts.reordered
 
     @property
     def resets(self) -> int:
         """Jumps of the device clock that began a new epoch."""
-        return self._estimator.counts.resets
+        return self._counts.resets
 
     @property
     def suspends(self) -> int:
         """Suspends of the host that were told."""
-        return self._estimator.counts.suspends
+        return self._counts.suspends
 
     @property
     def wraps(self) -> int:
         """Wraps of the streams' counters."""
-        return self._estimator.counts.wraps
+        return self._counts.wraps
 
     @property
     def late(self) -> int:
         """Samples held up for more than a second, mapped but not learnt from."""
-        return self._estimator.counts.late
+        return self._counts.late
 
     @property
     def rejected(self) -> int:
         """Samples with impossible ticks, stamped with their arrival."""
-        return self._estimator.counts.rejected
+        return self._counts.rejected
 
 
 def stored_sigma_ppm(sigma_ppm: float, age_s: float) -> float:

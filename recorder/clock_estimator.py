@@ -9,6 +9,7 @@ x is device time and y arrival minus device time, in ns since the anchor of the 
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -77,7 +78,7 @@ class SlewedLine:
 
 @dataclass(slots=True)
 class Counts:
-    """What was out of the ordinary; `late` and `rejected` samples were mapped but not learnt from."""
+    """What was out of the ordinary with one clock; `late` and `rejected` samples were mapped but not learnt from."""
 
     duplicates: int = 0
     reordered: int = 0
@@ -86,6 +87,7 @@ class Counts:
     wraps: int = 0
     late: int = 0
     rejected: int = 0
+    epochs: int = 0
 
 
 def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x: float) -> Line:
@@ -189,11 +191,18 @@ class Estimator:
 
     # -- epochs ----------------------------------------------------------------------------------------------------
 
+    def fork(self) -> Estimator:
+        """One more of the same past and the same axis, for a stream that restarts while others run on."""
+        twin = copy.copy(self)
+        twin.grid = None if self.grid is None else PollingGrid()
+        return twin
+
     def begin_epoch(self, shift_ns: int) -> None:
         """The clocks jumped against each other: shift the device axis so that the line runs on, learn anew."""
         fit = self.fit
         self.zero_ns += shift_ns
-        self.epoch += 1
+        self.counts.epochs += 1
+        self.epoch = self.counts.epochs
         self._past = [*self._past, self.line][-KEPT_EPOCHS:]
         sigma = min(max(KEPT_SKEW_PPM * PPM, fit.sd_slope), self._first_prior.sigma)
         self._begin(self.last_x, SlopePrior(fit.slope, sigma))
@@ -205,6 +214,8 @@ class Estimator:
         self.early_ns = float(LATE_NS)
         self.last_x = x
         self.refit_due = False
+        self.grid_line = None
+        self._settled = False
         if self.grid is not None:
             self.grid.restart()
         self._prior = prior
@@ -333,7 +344,10 @@ class Estimator:
             self._ready = (epoch, line)
 
     def settle(self) -> None:
-        """Nothing of this epoch has been put out yet: put out the newest line from the epoch's start on."""
+        """If nothing of this epoch has been put out yet: put out the newest line from the epoch's start on."""
+        if self._settled:
+            return
+        self._settled = True
         self._adopt()
         self.line = SlewedLine(self.line.start_x, self.fit.offset - self.floor_ns, self.fit.slope)
 

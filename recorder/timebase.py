@@ -174,7 +174,7 @@ class Timebase:
 
     def _stamp_all(self, waiting: list[tuple[_DeviceStream, int, int, Sample]]) -> list[Stamped]:
         """Samples that came together and would be stamped after their arrival are moved together: they stay apart."""
-        mapped_ns = [entry.clock.map.host_ns(device_ns) for entry, device_ns, _, _ in waiting]
+        mapped_ns = [entry.stream.host_ns(device_ns) for entry, device_ns, _, _ in waiting]
         beyond_ns: dict[tuple[str, int], int] = {}
         for (entry, _, arrival_ns, _), host_ns in zip(waiting, mapped_ns, strict=True):
             key = (entry.device, arrival_ns)
@@ -209,6 +209,6 @@ def _point_times(
     first = np.flatnonzero(is_new)
     counts = np.diff(first, append=len(device_s))
     ticks = np.rint(device_s[first] * entry.tick_hz).astype(np.int64)
-    host_ns = entry.clock.map.host_ns(entry.stream.unwrap(ticks))
+    host_ns = entry.stream.host_ns(entry.stream.unwrap(ticks))
     host_ns -= max(int(host_ns.max()) - arrival_ns, 0)  # all of them: else those that are late would share a time
     return host_ns.repeat(counts), ticks.repeat(counts)

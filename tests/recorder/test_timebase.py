@@ -132,6 +132,63 @@ def test_a_restarted_device_begins_an_epoch_that_is_told_once_held_and_stamped_w
     assert times == sorted(times)
 
 
+def two_devices(timebase: Timebase, restarts: tuple[str, ...], rng: np.random.Generator, held_up_ns: int = 0):
+    """30 s of a camera at 30 Hz and a slower one that share a clock and run against its host at 40 ppm.
+
+    restarts: those whose counter begins at zero again every 5 s, after a silence of a second. held_up_ns: so late is
+    the first second of the first camera. Gives what was stamped with its true time.
+    """
+    events = []
+    for device, period_ns in (("left", 33 * MS), ("right", 47 * MS)):
+        for taken_ns in range(0, 30 * S, period_ns):
+            start_ns = taken_ns // (5 * S) * 5 * S if device in restarts else 0
+            if start_ns and taken_ns - start_ns < 1 * S:
+                continue
+            delay_ns = FLOOR_NS + int(rng.gamma(2.0, 1.5 * MS))
+            if device == "left" and taken_ns < 1 * S:
+                delay_ns = max(delay_ns, held_up_ns - taken_ns * held_up_ns // S)
+            ticks = int((taken_ns - start_ns) * (1 + 40e-6)) + (77 * S if not start_ns else 5 * MS)
+            events.append((START_NS + taken_ns + delay_ns, device, ticks, taken_ns, taken_ns - start_ns))
+    stamped: list[Stamped] = []
+    last_ns = dict.fromkeys(("left", "right"), START_NS)
+    for arrival_ns, device, ticks, taken_ns, _ in sorted(events):
+        if arrival_ns - last_ns[device] > 800 * MS:
+            timebase.reconnected(device)
+        last_ns[device] = arrival_ns
+        stamped += take(timebase, device, arrival_ns, imu(ticks, taken_ns))
+    stamped += timebase.flush()
+    assert len(stamped) == len(events)
+    return {
+        device: np.array(
+            [(s.sample.sequence, s.host_ns - START_NS - s.sample.sequence) for s in stamped if s.device == device]
+        )
+        for device in ("left", "right")
+    }
+
+
+@pytest.mark.parametrize("restarts", [("left",), ("right",), ("left", "right")])
+def test_of_two_devices_on_one_clock_any_may_restart(restarts):
+    timebase = Timebase(START_NS)
+    for device in ("left", "right"):
+        timebase.add_device(device, "cameras", 1e9, 0, 0)
+    errors = two_devices(timebase, restarts, np.random.default_rng(3))
+    shared = timebase.clocks()["cameras"]
+    assert (shared.resets, shared.late, shared.rejected) == (5, 0, 0)
+    for device, table in errors.items():
+        settled = table[:, 0] > 2 * S
+        assert np.abs(table[settled, 1]).max() < (8 * MS if device in restarts else 4 * MS), device
+
+
+def test_a_device_that_is_held_up_at_its_start_does_not_part_from_the_others():
+    timebase = Timebase(START_NS)
+    for device in ("left", "right"):
+        timebase.add_device(device, "cameras", 1e9, 0, 0)
+    errors = two_devices(timebase, (), np.random.default_rng(4), held_up_ns=350 * MS)
+    assert timebase.clocks()["cameras"].resets == 0
+    for table in errors.values():
+        assert np.abs(table[:, 1]).max() < 5 * MS
+
+
 def test_a_wrapping_counter_runs_on():
     timebase = one_device()
     stamped = feed(timebase, 0, 1000, ticks_at_0=(1 << 32) - 1_500_000)
