@@ -123,7 +123,8 @@ class ClockStream:
         x = device_ns - estimator.anchor_device
         y = arrival_ns - estimator.anchor_host - x
         rest = y - estimator.fit.offset - estimator.fit.slope * x
-        if not -estimator.early_ns < rest < self._late_ns or self._irregular:
+        usual = -estimator.early_ns < rest < self._late_ns
+        if not usual or self._suspects or self._reconnected or self._lateness is not None:
             return self._observe_unsure(int(ticks), int(arrival_ns))
         if self._modulus and unwrapped // self._modulus != self._ticks // self._modulus:
             estimator.counts.wraps += 1
@@ -153,7 +154,12 @@ class ClockStream:
     def _observe_plain(self, ticks: Ints, arrival_ns: Ints) -> Ints | None:
         """The whole batch at once if nothing in it is out of the ordinary."""
         estimator = self.estimator
-        if self._irregular or int(np.abs(ticks).max()) > FAR // self._num:
+        if (
+            self._suspects
+            or self._reconnected
+            or self._lateness is not None
+            or int(np.abs(ticks).max()) > FAR // self._num
+        ):
             return None
         step = np.diff(ticks, prepend=self._ticks % self._modulus if self._modulus else self._ticks)
         if self._modulus:
@@ -191,13 +197,14 @@ class ClockStream:
         return self._ns(self._nearest(ticks)) + zero_ns
 
     @property
+    def is_heard(self) -> bool:
+        """It has had a sample."""
+        return self._epoch >= 0
+
+    @property
     def suspicious(self) -> bool:
         """The last sample's ticks were impossible, unless the next ones prove a restart."""
         return bool(self._suspects)
-
-    @property
-    def _irregular(self) -> bool:
-        return bool(self._suspects) or self._lateness is not None or self._reconnected
 
     # -- samples out of the ordinary -------------------------------------------------------------------------------
 
@@ -278,7 +285,7 @@ class ClockStream:
         self.estimator.begin_epoch(shift_ns)
 
     def _heard(self) -> list[ClockStream]:
-        return [stream for stream in self._family if stream._epoch >= 0]
+        return [stream for stream in self._family if stream.is_heard]
 
     def _follow(self, ticks: int, arrival_ns: int) -> bool:
         """Whether a sample that is off its line lies on that of a stream that restarted since: then go there."""
@@ -458,10 +465,7 @@ class ClockMap:
     @property
     def refit_due(self) -> bool:
         """Enough has come in for `refit` to be worth calling."""
-        for stream in self._streams:  # no generator: asked for each sample
-            if stream.estimator.refit_due:
-                return True
-        return False
+        return any(stream.estimator.refit_due for stream in self._streams)
 
     def refit(self) -> None:
         """Work out the line anew; a few ms, in any thread."""

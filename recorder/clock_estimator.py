@@ -115,7 +115,7 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x
     sd_slope = trust * grid.sd_slope + (1 - trust) * line.sd_slope
     unsure = math.hypot(grid.sd_height, law_error, CLEARANCE_ERROR * max(clearance, 0.0))
     sd_level = trust * unsure + (1 - trust) * line.sigma_ns(now_x)
-    return Line(here - slope * now_x, slope, sd_slope, sd_level, now_x, line.spread_ns)
+    return Line(float(here - slope * now_x), float(slope), float(sd_slope), float(sd_level), now_x, line.spread_ns)
 
 
 class Estimator:
