@@ -15,7 +15,8 @@ Columns: rms error in us from 10 s after the start on, the least delay of the li
     cover2, width2   the same for the two-sided stamps
     cpu       us per sample online, refits included
 
-Then what it costs: a sample one by one and in batches, the refits of a device, what is kept.
+Then what a second device gains from polls that are known already, and what it all costs:
+a sample one by one and in batches, the refits of a device, what is kept.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock import ClockMap, refine_all
+from recorder.clock_grid import GridTracker
 
 BOOT_NS = 200_000 * 10**9
 MS = 1e-3
@@ -266,6 +268,48 @@ def run(name: str, seeds: int, scale: float, settle_s: float) -> dict[str, float
     return row
 
 
+def sharing(seeds: int) -> None:
+    """Print what a device gains when another one is polled by the same controller for 10 s already."""
+    print(
+        "second device of a controller: rms in us in its seconds 1-5, 5-10, 10-20, 20-40; alone, and with shared polls"
+    )
+    for rate_hz in (50, 100, 200):
+        errors = np.zeros((2, 4))
+        for seed in range(50, 50 + seeds):
+            phase_s = np.random.default_rng(seed).uniform(0, MS)
+            first = polled(make(Link(USB, 400, 50), seed), 0.0, phase_s, seed)
+            second = polled(make(Link(USB, rate_hz, 40), seed + 500), 10.0, phase_s, seed + 1)
+            for row, is_shared in enumerate((False, True)):
+                clocks = ClockMap(1e6), ClockMap(1e6)
+                polls: list[GridTracker] = []
+                samples = []
+                for clock, trace in zip(clocks, (first, second), strict=True):
+                    if is_shared:
+                        clock.share_polls(polls)
+                    samples += zip(
+                        trace.arrival_ns.tolist(), trace.ticks.tolist(), [clock] * trace.ticks.size, strict=True
+                    )
+                samples.sort(key=lambda sample: sample[0])
+                stamps = [(clock, clock.map(tick, arrival)) for arrival, tick, clock in samples]
+                error_us = (np.array([s for c, s in stamps if c is clocks[1]]) - second.true_ns) / 1e3
+                age_s = (second.true_ns - second.true_ns[0]) / 1e9
+                for column, (begin, end) in enumerate(((1, 5), (5, 10), (10, 20), (20, 40))):
+                    within = (age_s >= begin) & (age_s < end)
+                    errors[row, column] += np.sqrt(np.mean(error_us[within] ** 2)) / seeds
+        rows = ("  ".join(f"{error:4.0f}" for error in row) for row in errors)
+        print(f"{rate_hz:4d} Hz:  " + "  |  ".join(rows), flush=True)
+
+
+def polled(trace: Trace, start_s: float, phase_s: float, seed: int) -> Trace:
+    """The same link, begun later and polled each ms from `phase_s` on."""
+    arrival_s = (trace.arrival_ns - BOOT_NS) / 1e9 + start_s
+    period_s = MS * (1 + 7e-6)
+    arrival_s = np.ceil((arrival_s - phase_s) / period_s) * period_s + phase_s
+    arrival_s += np.random.default_rng(seed).exponential(8 * US, arrival_s.size)
+    arrival_ns = np.maximum.accumulate(np.round(arrival_s * 1e9).astype(np.int64)) + BOOT_NS
+    return Trace(trace.true_ns + int(start_s * 1e9), trace.ticks, arrival_ns)
+
+
 def cost(scale: float) -> None:
     """Print CPU time per sample and per refit, and how much a map keeps."""
     trace = make(LINKS["lidar_6300hz"], 1, 0.5 * scale)
@@ -315,6 +359,7 @@ def main() -> None:
         worst = max(worst, row["ratio"])
         cells = (f"{row[c]:9.2f}" if c in columns[7:] else f"{row[c]:9.1f}" for c in columns)
         print(f"{name:22s}" + "".join(cells), flush=True)
+    sharing(1 if args.smoke else 8)
     cost(scale)
     print(f"worst ratio of online to the better of hull and the map without grid: {worst:.2f}")
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -75,6 +76,22 @@ def find_port(path: str, system: Path = SYSTEM) -> Port:
         timer if timer.exists() else None,
         _lasting_name(path, name, system) if name.startswith(("ttyUSB", "ttyACM")) else None,
     )
+
+
+def usb_controller(path: str, system: Path = SYSTEM) -> str | None:
+    """The root hub whose controller polls a USB serial port and the speed in Mbit/s; None for other ports.
+
+    Ports of one controller and speed are polled at the same times (USB 2.0, section 4.4: frames of 1 ms, microframes).
+    """
+    name = Path(os.path.realpath(path)).name
+    device = Path(os.path.realpath(system / "sys/class/tty" / name / "device"))
+    speed = None
+    for folder in (device, *device.parents):
+        with contextlib.suppress(OSError):
+            speed = speed or (folder / "speed").read_text().strip()
+        if re.fullmatch(r"usb\d+", folder.name):
+            return f"{folder}@{speed}"
+    return None
 
 
 def _kind(name: str, system: Path) -> Literal["uart", "cdc", "unknown"]:

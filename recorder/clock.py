@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from recorder.clock_estimator import KEPT_SKEW_PPM, LATE_NS, Estimator, Ints, S
 from recorder.clock_fit import PPM, Floats, SlopePrior
+from recorder.clock_grid import GridTracker
 from recorder.clock_refine import refine_epoch
 
 FAR = 1 << 61  # ticks and device times beyond this are garbage
@@ -406,6 +407,10 @@ class ClockMap:
     def stream(self, tick_hz: float, wrap_bits: int = 0) -> ClockStream:
         """Another stream of the same device clock, with ticks of its own."""
         return ClockStream(self._estimator, tick_hz, wrap_bits, self._streams)
+
+    def share_polls(self, siblings: list[GridTracker]) -> None:
+        """The link is polled by a host controller along with others: one list for all maps of that controller."""
+        self._estimator.share_polls(siblings)
 
     def _estimators(self) -> list[Estimator]:
         """One as a rule; more when streams restarted while others ran on."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock_fit import PPM, Bucket, Floats, Line, SlopePrior, blend, summarise
+from recorder.clock_grid import GridTracker
 from recorder.clock_polling import GridLine, PollingGrid
 
 Ints = NDArray[np.int64]
@@ -148,6 +149,8 @@ class Estimator:
         """Put the anchor on the first sample."""
         self.started = True
         self.anchor_device, self.anchor_host = device_ns, arrival_ns
+        if self.grid is not None:
+            self.grid.tracker.origin_ns = arrival_ns
 
     # -- evaluating ------------------------------------------------------------------------------------------------
 
@@ -194,8 +197,17 @@ class Estimator:
     def fork(self) -> Estimator:
         """One more of the same past and the same axis, for a stream that restarts while others run on."""
         twin = copy.copy(self)
-        twin.grid = None if self.grid is None else PollingGrid()
+        if self.grid is not None:
+            twin.grid = PollingGrid()
+            twin.grid.tracker.origin_ns = self.anchor_host
+            twin.share_polls(self.grid.tracker.siblings)
         return twin
+
+    def share_polls(self, siblings: list[GridTracker]) -> None:
+        """Polls are shared with these; the own ones join them."""
+        if self.grid is not None and self.grid.tracker not in siblings:
+            siblings.append(self.grid.tracker)
+            self.grid.tracker.siblings = siblings
 
     def begin_epoch(self, shift_ns: int) -> None:
         """The clocks jumped against each other: shift the device axis so that the line runs on, learn anew."""

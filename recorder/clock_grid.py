@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,8 @@ MAX_PER_BUCKET = 400  # arrivals looked at while searching
 WALK = 1e-8 / math.sqrt(S)  # random walk of the polls' relative frequency, per sqrt(ns)
 MAX_FREQUENCY = 4e-4
 LOST_PIECES = 7
+KNOWN_FREQUENCY = 1e-6  # one sigma of it, from which on others may use it
+ADOPT_WITHIN = 0.1  # of the period
 OFF_GRID = 0.015  # of the period: a bucket further from its polls belongs to another grid
 CELLS_PER_PERIOD = 40
 RESIDUES = 30
@@ -218,13 +221,26 @@ class Fitted:
 # -- finding and following the polls ----------------------------------------------------------------------------------
 
 
+class Polls(NamedTuple):
+    """Nominal period (ns), how much longer it is (relative), one poll, covariance of its time and the frequency."""
+
+    period_ns: float
+    frequency: float
+    edge: float
+    edge_index: int
+    covariance: Floats
+
+
 class GridTracker:
     """Finds the polling period in arrivals, then follows phase and frequency with a Kalman filter.
 
-    Several clocks whose links are polled by one controller may share a tracker.
+    siblings: trackers of links that the same controller polls. While this one searches it takes over what another one
+    knows if its own arrivals lie on those polls.
     """
 
     def __init__(self) -> None:
+        self.siblings: list[GridTracker] = []
+        self.origin_ns = 0  # host time from which the arrivals are counted
         self.period_ns = 0.0  # nominal; 0 while none is found
         self._forget()
 
@@ -243,6 +259,31 @@ class GridTracker:
         self._frequency = 0.0  # how much longer than nominal the period is, relative
         self._covariance = np.zeros((2, 2))  # of edge (ns) and frequency
         self._lost = 0
+
+    @property
+    def polls(self) -> Polls | None:
+        """What is known of the polls, once that is enough for others."""
+        if not self.period_ns or self._lost or self._covariance[1, 1] > KNOWN_FREQUENCY**2:
+            return None
+        return Polls(self.period_ns, self._frequency, self._edge, self._edge_index, self._covariance)
+
+    def _adopt(self, arrival: Floats) -> bool:
+        """Take over a sibling's polls if all arrivals lie on them, and not only on each second or fifth."""
+        for other in self.siblings:
+            polls = None if other is self else other.polls
+            if polls is None or arrival.size < CHUNK:
+                continue
+            period = polls.period_ns * (1 + polls.frequency)
+            edge = polls.edge + (other.origin_ns - self.origin_ns)
+            away = (arrival - edge) / period
+            low, middle, high = np.quantile(away - np.rint(away), (0.1, 0.25, 0.75))
+            steps = np.rint(away).astype(np.int64)
+            one_residue = any(np.all((steps - steps[0]) % factor == 0) for factor in (2, 5))
+            if max(high - low, abs(middle)) < ADOPT_WITHIN and not one_residue:
+                self.period_ns, self._frequency, self._lost = polls.period_ns, polls.frequency, 0
+                self._edge, self._edge_index, self._covariance = edge, polls.edge_index, polls.covariance
+                return True
+        return False
 
     def rewound(self, arrival: Floats) -> GridTracker:
         """A tracker that knows the period and frequency already and begins at the first of these arrivals."""
@@ -276,6 +317,8 @@ class GridTracker:
     def _search(self, arrival: Floats) -> None:
         fresh = np.unique(arrival[:: math.ceil(arrival.size / MAX_PER_BUCKET)])
         seen = np.concatenate([self._recent, fresh])
+        if self._adopt(seen):
+            return
         new = (fresh.size + self._recent.size % CHUNK) // CHUNK
         periods = np.array(PERIODS_NS)
         for i in range(new):

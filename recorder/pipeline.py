@@ -23,6 +23,7 @@ from drivers.samples import (
     Sample,
     ScanSample,
 )
+from drivers.serial_ports import usb_controller
 from recorder.clock import ClockMap
 from recorder.recording.manifest import NS_PER_S, ClockState, ClockSummary, EpochSummary, StreamSummary
 from recorder.recording.raw import NONE, scan_rows
@@ -131,6 +132,10 @@ class Pipeline:
     def reconnected(self, device: str) -> None:
         """The device was lost and is connected again; what it sends from now on may be by a restarted clock."""
         self._timebase.reconnected(device)
+        port = getattr(self._devices[device].config, "port", None)
+        controller = usb_controller(port) if isinstance(port, str) else None
+        if controller is not None:
+            self._timebase.polled_by(device, controller)
 
     def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
         """Feed one sample with its arrival on the host's monotonic clock."""

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from drivers.samples import ClockPairs, Sample, ScanSample
 from recorder.clock import ClockMap, ClockStream
+from recorder.clock_grid import GridTracker
 
 HOLD_AT_START_NS = 1_000_000_000
 HOLD_NS = 400_000_000
@@ -71,6 +72,7 @@ class Timebase:
         self._refitting = threading.Lock()
         self._clocks: dict[str, _Clock] = {}
         self._streams: dict[str, _DeviceStream] = {}
+        self._polls: dict[str, list[GridTracker]] = {}  # by host controller
         self._unclocked: list[Stamped] = []  # of devices that send no time
         self._epochs_begun: list[tuple[str, int]] = []
 
@@ -124,6 +126,11 @@ class Timebase:
     def reconnected(self, device: str) -> None:
         """The device was lost and is connected again: its clock may have restarted."""
         self._streams[device].stream.expect_restart()
+
+    def polled_by(self, device: str, controller: str) -> None:
+        """Which host controller polls the device's link. Those of one controller share what is known of its polls."""
+        with self._refitting:
+            self._streams[device].clock.map.share_polls(self._polls.setdefault(controller, []))
 
     def epochs_begun(self) -> list[tuple[str, int]]:
         """Clocks (with their epoch) that began a new sync epoch since this was last called."""

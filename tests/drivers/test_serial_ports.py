@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.serial_ports import find_port
+from drivers.serial_ports import find_port, usb_controller
 
 
 def make_adapter(system: Path, name: str, driver: str, timer: str | None = None) -> None:
@@ -79,3 +79,29 @@ def test_pty_has_no_baud_rate() -> None:
     assert (port.kind, port.byte_time_ns(9600), port.advice()) == ("pty", 0.0, None)
     os.close(master)
     os.close(slave)
+
+
+def plug(system: Path, name: str, place: str, speed: str) -> None:
+    """A USB serial port at a place such as usb1/1-2/1-2:1.0."""
+    root, device = place.split("/")[0], place.rsplit("/", 1)[0]
+    bus = system / "sys/devices/pci0000:00/0000:00:14.0"
+    (bus / place / name).mkdir(parents=True)
+    (bus / root / "speed").write_text("480\n")
+    (bus / device / "speed").write_text(f"{speed}\n")
+    tty = system / "sys/class/tty" / name
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to(bus / place / (name if name.startswith("ttyUSB") else ""))
+
+
+def test_ports_of_one_controller_and_speed_are_polled_together(tmp_path: Path) -> None:
+    plug(tmp_path, "ttyUSB0", "usb1/1-2/1-2:1.0", "12")
+    plug(tmp_path, "ttyACM0", "usb1/1-3/1-3.4/1-3.4:1.0", "12")
+    plug(tmp_path, "ttyACM1", "usb1/1-5/1-5:1.0", "480")
+    plug(tmp_path, "ttyUSB1", "usb3/3-1/3-1:1.0", "12")
+    keys = [usb_controller(f"/dev/{name}", tmp_path) for name in ("ttyUSB0", "ttyACM0", "ttyACM1", "ttyUSB1")]
+    assert keys[0] is not None
+    assert keys[0].endswith("/usb1@12")
+    assert keys[0] == keys[1]
+    assert len(set(keys)) == 3
+    assert usb_controller("/dev/ttyS0", tmp_path) is None
+    assert usb_controller("/dev/pts/0", tmp_path) is None

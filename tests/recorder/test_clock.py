@@ -10,6 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from recorder.clock import ClockMap, refine, stored_sigma_ppm
+from recorder.clock_grid import GridTracker
 
 BOOT_NS = 250_000 * 10**9
 MS = 1_000_000
@@ -125,6 +126,28 @@ def test_polling_grid_gives_slope_and_level() -> None:
     assert with_grid < 60
     assert with_grid < 1.1 * without
     assert rms_us(refine(t.ticks, t.arrival_ns, 1e6), t, after_s=0.0) < 20
+
+
+@pytest.mark.parametrize("poll_ms", [1.0, 0.0])
+def test_a_controllers_polls_are_known_from_another_device(poll_ms: float) -> None:
+    """The second device starts 15 s after the first one; if it is not on the same polls, it takes nothing over."""
+    first = trace(rate_hz=400.0, duration_s=28.0, poll_ms=1.0, jitter_ms=0.7)
+    whole = trace(seed=3, rate_hz=100.0, duration_s=45.0, poll_ms=poll_ms, jitter_ms=0.7, skew_ppm=-70.0)
+    second = Trace(whole.true_ns[1500:], whole.ticks[1500:], whole.arrival_ns[1500:])
+    alone = second.mapped(ClockMap(1e6))
+    polls: list[GridTracker] = []
+    clocks = ClockMap(1e6), ClockMap(1e6)
+    samples = []
+    for clock, t in zip(clocks, (first, second), strict=True):
+        clock.share_polls(polls)
+        samples += zip(t.arrival_ns.tolist(), t.ticks.tolist(), [clock] * t.ticks.size, strict=True)
+    stamps = [(clock, clock.map(tick, arrival)) for arrival, tick, clock in sorted(samples, key=lambda s: s[0])]
+    shared = np.array([stamp for clock, stamp in stamps if clock is clocks[1]])
+    assert_causal(shared, second)
+    if poll_ms:
+        assert rms_us(shared, second, after_s=5.0) < 0.7 * rms_us(alone, second, after_s=5.0)
+    else:
+        assert (shared == alone).all()
 
 
 def test_a_devices_own_rhythm_is_no_polling_grid() -> None:
