@@ -399,6 +399,26 @@ def test_what_was_measured_before_time_0_is_counted_and_not_recorded(tmp_path, r
     assert read_lines(tmp_path)[0]["time"] >= 0
 
 
+def test_serial_ports_of_one_controller_share_its_polls(monkeypatch):
+    class SerialConfig(DeviceConfig):
+        port: str = ""
+
+    class UdpConfig(DeviceConfig):
+        port: int = 9000
+
+    devices = devices_of(("imu", "gnss", "pose", "lidar"))
+    for device, path in zip(devices, ("/dev/ttyACM0", "/dev/ttyACM1", "/dev/ttyS0"), strict=False):
+        device.config = SerialConfig(driver="made-up", port=path)
+    devices[3].config = UdpConfig(driver="made-up")
+    monkeypatch.setattr("recorder.pipeline.usb_controller", lambda path: "usb1@12" if "ACM" in path else None)
+    shared = []
+    monkeypatch.setattr("recorder.pipeline.Timebase.polled_by", lambda self, *polled: shared.append(polled))
+    pipeline = Pipeline(None, devices, START_NS, 10 * MS)
+    for device in devices:
+        pipeline.reconnected(device.name)
+    assert shared == [("imu", "usb1@12"), ("gnss", "usb1@12")]
+
+
 def test_a_new_epoch_is_an_event(tmp_path):
     bench = Bench(tmp_path, ("imu",))
 
