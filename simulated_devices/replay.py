@@ -49,6 +49,7 @@ log = logging.getLogger(__name__)
 PORT_KEYS = ("msop_port", "difop_port", "port", "udp")
 GONE_KEYS = frozenset(("tcp", "multicast_group", "interface", "url", "format", "options"))
 HANDSHAKE_CHUNKS, PORT_CHUNKS = 2000, 20_000
+RECORDED_CLOCK = "recorded"  # of cameras that come back with the times of the recording
 LINE_BAUD = 4_000_000
 LINE_COLUMNS = ["time", "ax", "ay", "az", "gx", "gy", "gz"]
 POSE_PORT = 5005
@@ -184,36 +185,47 @@ class Playbill:
                 self.left_out.append(f"{name}: has no pictures")
                 continue
             summary = manifest.devices.get(name) if manifest else None
-            keys: dict[str, Any] = {"clock": "cameras"}
+            own_times = self._own_times(name, shown.time_ns)
+            ticks, arrival_ns = own_times or (shown.time_ns, shown.time_ns)
+            keys: dict[str, Any] = {}
             if manifest and summary and summary.driver == "stream":
-                keys = _rig_keys(manifest.rig.get("devices", {}).get(name), summary) | {"clock": summary.clock}
+                keys = _rig_keys(manifest.rig.get("devices", {}).get(name), summary)
+            if summary and own_times:
+                keys |= {"clock": summary.clock, "latency_s": summary.latency_s}
+            else:
+                keys |= {"clock": RECORDED_CLOCK}
             keys |= {"driver": "stream", "required": False}
             keys.setdefault("fps", round(_rate_hz(shown), 3))
-            ticks, arrival_ns = self._picture_times(name, shown.time_ns)
             script = functools.partial(self._picture_script, video, shown.picture[:, camera], ticks, arrival_ns)
             own_name = name.replace(".", "_")  # a stream of an OAK is no name of a device
             self._add(PictureReplay(own_name, self._performance, video, script), keys)
 
-    def _picture_times(self, name: str, time_ns: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """The camera's own time and the arrival of each picture, in ns; the recording's where they were not kept."""
-        ticks, arrival_ns = time_ns.copy(), time_ns.copy()
+    def _own_times(self, name: str, time_ns: Int64Array) -> tuple[Int64Array, Int64Array] | None:
+        """The camera's own time and the arrival of each picture, in ns; None where they were not kept for all.
+
+        time_ns: of the lines that name the pictures. A line of several cameras has the time of one of them.
+        """
         manifest = self._recording.manifest
         table = self._folder / FOLDER / f"{name}.clock"
-        tick_hz = manifest.devices[name].tick_hz if manifest else None
+        tick_hz = manifest.devices[name].tick_hz if manifest and name in manifest.devices else None
         if manifest is None or tick_hz is None or not table.is_file():
-            return ticks, arrival_ns
+            return None
         rows = read_clock_table(table)
         refined = table.with_suffix(".refined")
         stamps = np.fromfile(refined, "<i8").astype(np.int64)[: len(rows)] if refined.is_file() else rows[:, 2]
         rows = rows[: len(stamps)]
-        order = np.argsort(stamps, kind="stable")
-        found = order[np.minimum(np.searchsorted(stamps[order], time_ns), len(order) - 1)]
-        known = (np.abs(stamps[found] - time_ns) <= MICROSECOND_NS) & (rows[found, 1] != NONE)
-        ticks[known] = np.rint(rows[found[known], 0] * (SECOND_NS / tick_hz)).astype(np.int64)
-        arrival_ns[known] = rows[found[known], 1] - manifest.start_monotonic_ns
-        if not known.all():  # two clocks must not be mixed
-            return time_ns.copy(), arrival_ns
-        return ticks, arrival_ns
+        known = np.flatnonzero((rows[:, 1] != NONE) & (stamps != NONE))
+        order = known[np.argsort(stamps[known], kind="stable")]
+        if not len(order):
+            return None
+        after = np.clip(np.searchsorted(stamps[order], time_ns), 1, max(len(order) - 1, 1))
+        candidates = order[np.clip(np.stack([after - 1, after]), 0, len(order) - 1)]
+        away_ns = np.abs(stamps[candidates] - time_ns)
+        found = np.where(away_ns[0] <= away_ns[1], candidates[0], candidates[1])
+        if away_ns.min(axis=0).max() >= _period_ns(time_ns) / 2:  # two clocks must not be mixed
+            return None
+        ticks = np.rint(rows[found, 0] * (SECOND_NS / tick_hz)).astype(np.int64)
+        return ticks, rows[found, 1] - manifest.start_monotonic_ns
 
     def _picture_script(
         self, video: Path, pictures: Int64Array, ticks: Int64Array, arrival_ns: Int64Array
@@ -240,6 +252,10 @@ class Playbill:
                 "driver": "ascii-imu", "baud": LINE_BAUD, "columns": LINE_COLUMNS, "time_unit": "s",
                 "rate_hz": round(_rate_hz(imu), 3),
             }  # fmt: skip
+            if imu.unpaired:
+                self.left_out.append(
+                    f"imu: {imu.unpaired} readings of the gyroscope without acceleration at their time"
+                )
             values = np.hstack([imu.accel_m_s2, imu.gyro_rad_s])
             self._add(self._serial("imu", functools.partial(self._imu_script, imu.time_ns, values)), keys)
         fixes = self._recording.fixes
@@ -308,6 +324,8 @@ def _rig_keys(entry: object, summary: DeviceSummary) -> dict[str, Any]:
 
 
 def _rate_hz(series: Series) -> float:
-    if len(series) < 2:
-        return 1.0
-    return float(SECOND_NS / np.median(np.diff(series.time_ns)))
+    return SECOND_NS / _period_ns(series.time_ns)
+
+
+def _period_ns(time_ns: Int64Array) -> float:
+    return float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else float(SECOND_NS)

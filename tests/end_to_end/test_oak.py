@@ -10,7 +10,11 @@ import pytest
 import yaml
 
 from recorder.recording.raw import read_clock_table
+from recorder.rig import DEVICE_NAME
 from simulated_devices.oak_pictures import STAMP_NS, read_number
+from simulated_devices.replay import Playbill
+from simulated_devices.replayed import PictureReplay
+from simulated_devices.timing import Stage
 
 RIG = {
     "simulate": {
@@ -91,3 +95,20 @@ def test_what_the_device_knows_of_itself_is_kept(take: Path) -> None:
     assert (lens["imageWidth"], lens["imageHeight"]) == (640, 256)
     calibration = json.loads((take / "calibration.json").read_text())
     assert lens["intrinsicMatrix"][0][0] == pytest.approx(calibration["cameras"][1]["focalLengthX"], rel=1e-6)
+
+
+def test_replay_sends_each_picture_with_its_own_device_time(take: Path) -> None:
+    bill = Playbill(take, Stage(0), 1.0)
+    bill.ports.close()
+    entries = bill.document["devices"]
+    assert entries.keys() == {"oak_left", "oak_right", "imu"}
+    assert all(DEVICE_NAME.fullmatch(name) for name in entries)
+    assert entries["oak_left"]["clock"] == entries["oak_right"]["clock"] == "oak"
+    assert entries["imu"]["driver"] == "ascii-imu"
+    cameras = [device for device in bill.devices if isinstance(device, PictureReplay)]
+    for device, name in zip(cameras, ("data.mkv", "data2.mkv"), strict=True):
+        script = list(device._script())
+        stamps = [stamp for stamp, _ in drawn(take / name)]
+        assert len(script) == len(stamps)
+        assert max(abs(us * 1000 // STAMP_NS - stamp) for (_, us, _), stamp in zip(script, stamps, strict=True)) <= 1
+        assert [due_ns for due_ns, _, _ in script] == sorted(due_ns for due_ns, _, _ in script)
