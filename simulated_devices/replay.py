@@ -41,7 +41,7 @@ from simulated_devices.replayed import (
     Script,
     SerialReplay,
 )
-from simulated_devices.simulation import SimulatedDevice, Simulation, UdpPorts
+from simulated_devices.simulation import Simulation, UdpPorts
 from simulated_devices.timing import SECOND_NS, WORLD_START_DELAY_NS, Int64Array, Stage
 
 log = logging.getLogger(__name__)
@@ -50,13 +50,15 @@ PORT_KEYS = ("msop_port", "difop_port", "port", "udp")
 GONE_KEYS = frozenset(("tcp", "multicast_group", "interface", "url", "format", "options"))
 HANDSHAKE_CHUNKS, PORT_CHUNKS = 2000, 20_000
 RECORDED_CLOCK = "recorded"  # of cameras that come back with the times of the recording
+Replayed = SerialReplay | DatagramReplay | PictureReplay
 LINE_BAUD = 4_000_000
 LINE_COLUMNS = ["time", "ax", "ay", "az", "gx", "gy", "gz"]
 POSE_PORT = 5005
 MICROSECOND_NS = 1000
-# Nothing can be sent again, so whoever opened the devices must have stopped to wait for the silent ones, and read.
-SETTLE_NS = 7 * SECOND_NS
-BEGINS_S = (SETTLE_NS + WORLD_START_DELAY_NS) // SECOND_NS
+# Nothing can be sent again, so whoever opened the devices must have stopped to wait for the silent ones (5 s for a
+# picture, 3 s for a datagram, not at all for a serial line), and read; but not yet for 3 s, for then it closes a port
+# that is silent and opens it anew.
+SETTLE_NS = {PictureReplay: 6 * SECOND_NS, DatagramReplay: 4 * SECOND_NS, SerialReplay: 0}
 
 
 def replay(folder: Path, speed: float, *, report: bool = False) -> Simulation:
@@ -65,8 +67,10 @@ def replay(folder: Path, speed: float, *, report: bool = False) -> Simulation:
     bill = Playbill(folder, stage, speed)
     for reason in bill.left_out:
         log.warning("left out: %s", reason)
-    log.warning("replaying %.1f s, beginning %d s after the first device is opened", bill.duration_s, BEGINS_S)
-    return Simulation(bill.devices, bill.document, stage, bill.ports, settle_ns=SETTLE_NS, report=report)
+    settle_ns = max(SETTLE_NS[type(device)] for device in bill.devices)
+    begins_s = (settle_ns + WORLD_START_DELAY_NS) // SECOND_NS
+    log.warning("replaying %.1f s, beginning %d s after the first device is opened", bill.duration_s, begins_s)
+    return Simulation(bill.devices, bill.document, stage, bill.ports, settle_ns=settle_ns, report=report)
 
 
 class Playbill:
@@ -84,7 +88,7 @@ class Playbill:
         self._folder = folder.resolve()
         self._performance = Performance(stage, speed)
         self.ports = UdpPorts()
-        self.devices: list[SimulatedDevice] = []
+        self.devices: list[Replayed] = []
         self.left_out: list[str] = []
         self._entries: dict[str, dict[str, Any]] = {}
         self._addresses: dict[str, str] = {}
@@ -308,7 +312,7 @@ class Playbill:
             message = pose_message(index, at_ns // MICROSECOND_NS, turned, poses.position_m[index])
             yield self._due(at_ns), port, message
 
-    def _add(self, device: SimulatedDevice, keys: dict[str, Any]) -> None:
+    def _add(self, device: Replayed, keys: dict[str, Any]) -> None:
         self.devices.append(device)
         self._entries[device.name] = keys
 
