@@ -149,7 +149,7 @@ class Table:
     def offset(
         self, name: str, folder: Path, true_ms: float, limit_ms: float, limit_deg: float, clock_ms: float
     ) -> None:
-        """clock_ms: how uncertain the recording itself says its clocks are; that error is in the offset, truly."""
+        """clock_ms: how uncertain the recording itself says its clocks are, for the reader; the limit knows nothing of it."""
         for index, found in enumerate(look(folder).cameras):
             if isinstance(found, NotShown):
                 self.add(f"{name}, camera {index}", found.reason, "a number", False)
