@@ -203,16 +203,20 @@ class PictureReplay:
         with av.open(str(self._video)) as source, av.open(target, "w", format="nut", options=flushed) as nut:
             stream = nut.add_stream_from_template(source.streams.video[0])
             stream.time_base = MICROSECONDS
-            while waiting and self._stays(client, waiting[0][0]):
-                due_ns, time_us, packet = waiting.popleft()
-                waiting.extend(itertools.islice(pictures, 1))
+            while waiting:
+                due_ns, time_us, packet = waiting[0]
                 packet.pts = packet.dts = time_us
                 packet.time_base = MICROSECONDS  # the muxer's own is another
                 packet.stream = stream
                 nut.mux(packet)
-                if not send_all(client, target.take()):
+                data = target.take()
+                if not self._stays(client, due_ns):
+                    return
+                waiting.popleft()
+                if not send_all(client, data):
                     return
                 self._pacer.done(self._performance.host_ns(due_ns))
+                waiting.extend(itertools.islice(pictures, 1))
 
     def _stays(self, client: socket.socket, due_ns: int) -> bool:
         """Wait for the start, and until then; False when the client leaves before."""
