@@ -101,11 +101,14 @@ def test_every_replug_is_recovered_and_its_gap_is_the_silence(tmp_path, monkeypa
             if cycle == CYCLES - 1:
                 break
             imu.pty.replug()
-        assert (open_files(tmp_path), threading.active_count()) == settled
+        # Threads of other tests in this process may end meanwhile; none may be added.
+        assert open_files(tmp_path) == settled[0]
+        assert threading.active_count() <= settled[1]
     finally:
         take.end()
         imu.pty.close()
-    assert (open_files(tmp_path), threading.active_count()) == (files_before, threads_before)
+    assert open_files(tmp_path) == files_before
+    assert threading.active_count() <= threads_before
 
     start_s = take.manifest.start_monotonic_ns / 1e9
     events = [json.loads(line) for line in (take.folder / "events.jsonl").read_text().splitlines()]
