@@ -81,7 +81,7 @@ def open_files(apart_from: Path) -> int:
 
 def test_every_replug_is_recovered_and_its_gap_is_the_silence(tmp_path, monkeypatch):
     monkeypatch.setattr("drivers.device.RETRY_S", 0.002)
-    files_before, threads_before = open_files(tmp_path), threading.active_count()
+    files_before, threads_before = open_files(tmp_path), set(threading.enumerate())
     imu = Imu(tmp_path / "imu")
     take = Take(tmp_path / "imu", tmp_path)
     unplugged_s, plugged_s = [], []  # for each: before and after it was noticed, on the host's clock
@@ -97,18 +97,17 @@ def test_every_replug_is_recovered_and_its_gap_is_the_silence(tmp_path, monkeypa
             assert take.has("lost", cycle + 1, PATIENCE_S), f"cycle {cycle}: the loss was not noticed"
             unplugged_s.append((begin_s, time.monotonic()))
             if cycle == SETTLED_CYCLE:
-                settled = open_files(tmp_path), threading.active_count()
+                settled = open_files(tmp_path), set(threading.enumerate())
             if cycle == CYCLES - 1:
                 break
             imu.pty.replug()
-        # Threads of other tests in this process may end meanwhile; none may be added.
         assert open_files(tmp_path) == settled[0]
-        assert threading.active_count() <= settled[1]
+        assert set(threading.enumerate()) <= settled[1]
     finally:
         take.end()
         imu.pty.close()
     assert open_files(tmp_path) == files_before
-    assert threading.active_count() <= threads_before
+    assert set(threading.enumerate()) <= threads_before
 
     start_s = take.manifest.start_monotonic_ns / 1e9
     events = [json.loads(line) for line in (take.folder / "events.jsonl").read_text().splitlines()]
