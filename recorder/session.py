@@ -14,20 +14,19 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.model import Calibration, CalibrationError, dump, load_calibration, validate
-from drivers.device import DeviceError, Driver, StreamSpec, received
+from drivers.device import Driver, received
 from drivers.samples import DeviceEvent, FrameSample, LostFrame, Received, ScanSample
-from recorder.errors import ConfigError, RecorderError, StorageError
+from recorder.errors import StorageError
 from recorder.pipeline import DeviceInTake, Pipeline, count_event
+from recorder.preparation import OnEvent, Stream, cameras_of, checked_calibration, connect, streams_of
 from recorder.recording.folder import check_output, create_take_folder, free_bytes, low_water_bytes
 from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, StreamSummary
 from recorder.recording.work import ByteQueue
 from recorder.recording.writer import RecordingWriter, new_manifest
-from recorder.rig import Rig, RigDevice
+from recorder.rig import Rig
 from recorder.skews import Skew, SkewStore, device_key
 
 log = logging.getLogger(__name__)
@@ -39,10 +38,6 @@ STATUS_EVERY_S = 0.5
 REFIT_EVERY_S = 0.02
 MIN_SUSPEND_NS = 20_000_000
 MIN_SKEW_TAKE_S = 30.0
-
-
-class DevicesMissingError(RecorderError):
-    """Required devices that cannot be used: one line for each, with what was tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +66,6 @@ class TakeStatus:
 
 
 OnStatus = Callable[[TakeStatus], None]
-OnEvent = Callable[[str, DeviceEvent], None]
 
 
 def record(
@@ -92,10 +86,10 @@ def record(
     required devices that are missing; StorageError when the files can't be finished.
     """
     drivers = {device.name: device.driver.create(device.name, device.config) for device in rig.devices}
-    calibration = _calibration(rig, _cameras(_streams(rig, drivers)))
+    calibration = checked_calibration(rig, cameras_of(streams_of(rig, drivers)))
     bytes_per_s = sum(stream.bytes_per_s for driver in drivers.values() for stream in driver.streams)
     check_output(out, bytes_per_s)
-    connected = _connect(rig, drivers, stop, on_event)
+    connected = connect(rig, drivers, stop, on_event)
     try:
         folder = create_take_folder(out, name, time.time_ns())
         take = Take(rig, drivers, connected, folder, calibration, bytes_per_s, on_event, skews)
@@ -104,107 +98,6 @@ def record(
             driver.close()
         raise
     return folder, take.run(duration_s, stop, on_status)
-
-
-@dataclass(frozen=True, slots=True)
-class _Stream:
-    """One stream of a device, by the name it has in the recording."""
-
-    name: str
-    device: RigDevice
-    spec: StreamSpec
-
-    @property
-    def clock(self) -> str:
-        """Name of the clock that stamps it."""
-        return self.device.clock
-
-
-def _streams(rig: Rig, drivers: dict[str, Driver]) -> list[_Stream]:
-    return [
-        _Stream(f"{device.name}.{spec.name}" if spec.name else device.name, device, spec)
-        for device in rig.devices
-        for spec in drivers[device.name].streams
-    ]
-
-
-def _cameras(streams: list[_Stream]) -> list[_Stream]:
-    """Cameras in the order of their index: first all on the clock of the first one, then the other clocks'."""
-    cameras = [stream for stream in streams if stream.spec.kind == "frames"]
-    clocks = list(dict.fromkeys(camera.clock for camera in cameras))
-    return sorted(cameras, key=lambda camera: clocks.index(camera.clock))
-
-
-def _calibration(rig: Rig, cameras: list[_Stream]) -> bytes | None:
-    if rig.calibration is None:
-        return None
-    try:
-        calibration = load_calibration(rig.calibration)
-    except CalibrationError as error:
-        raise ConfigError(str(error)) from error
-    faults = validate(calibration) + _too_few(calibration, cameras) + _other_size(calibration, cameras)
-    if faults:
-        raise ConfigError("\n".join(f"{rig.calibration}: {fault}" for fault in faults))
-    return dump(calibration)
-
-
-def _too_few(calibration: Calibration, cameras: list[_Stream]) -> list[str]:
-    cameras = [camera for camera in cameras if camera.clock == cameras[0].clock]  # clients take these
-    if len(calibration.cameras) >= len(cameras):
-        return []
-    names = ", ".join(camera.name for camera in cameras)
-    return [f"has {len(calibration.cameras)} cameras, the rig has {len(cameras)} ({names})"]
-
-
-def _other_size(calibration: Calibration, cameras: list[_Stream]) -> list[str]:
-    """Cameras whose pictures are set to another size than the calibration is for."""
-    faults = []
-    for index, (lens, camera) in enumerate(zip(calibration.cameras, cameras, strict=False)):
-        size = (_side(camera, "width"), _side(camera, "height"))
-        expected = (lens.image_width_px, lens.image_height_px)
-        if None not in size and size != expected:
-            faults.append(
-                f"camera {index} is for {expected[0]}x{expected[1]} pictures, {camera.name} sends {size[0]}x{size[1]}"
-            )
-    return faults
-
-
-def _side(camera: _Stream, side: str) -> int | None:
-    """What is configured for pictures of a camera, by a key for this one or for all of the device; None: nothing."""
-    config = camera.device.config
-    found: int | None = getattr(config, f"{camera.spec.name}_{side}", getattr(config, side, None))
-    return found
-
-
-def _connect(rig: Rig, drivers: dict[str, Driver], stop: threading.Event, on_event: OnEvent) -> set[str]:
-    """Open all devices at once. Gives those that answered; raises when a required one did not."""
-
-    def attempt(device: RigDevice) -> str | None:
-        try:
-            drivers[device.name].connect()
-        except DeviceError as error:
-            return str(error)
-        return None
-
-    try:
-        with ThreadPoolExecutor(max_workers=len(rig.devices)) as pool:
-            faults = dict(zip((device.name for device in rig.devices), pool.map(attempt, rig.devices), strict=True))
-    except BaseException:
-        for driver in drivers.values():
-            driver.close()
-        raise
-    missing = [device for device in rig.devices if faults[device.name] is not None]
-    required = [f"device {device.name}: {faults[device.name]}" for device in missing if device.config.required]
-    if required or stop.is_set():
-        for driver in drivers.values():
-            driver.close()
-    if required:
-        raise DevicesMissingError("\n".join(required) + "\n(a device with `required: false` may come later)")
-    if stop.is_set():
-        raise RecorderError("stopped before the take began; nothing was recorded")
-    for device in missing:
-        on_event(device.name, DeviceEvent("warning", f"not there yet: {faults[device.name]}"))
-    return {device.name for device in rig.devices} - {device.name for device in missing}
 
 
 class Take:
@@ -233,8 +126,8 @@ class Take:
         self._is_merged = False
         self._inbox: ByteQueue[tuple[str, Received]] = ByteQueue(INBOX_BYTES)
         self._start_ns = time.monotonic_ns()
-        streams = _streams(rig, drivers)
-        cameras = _cameras(streams)
+        streams = streams_of(rig, drivers)
+        cameras = cameras_of(streams)
         self._names = {
             device.name: tuple(stream.name for stream in streams if stream.device is device) for device in rig.devices
         }
@@ -263,7 +156,7 @@ class Take:
         self._last_counts: dict[str, int] = {}
         self._last_status_s = time.monotonic()
 
-    def _new_manifest(self, rig: Rig, name: str, streams: list[_Stream], cameras: list[_Stream]) -> Manifest:
+    def _new_manifest(self, rig: Rig, name: str, streams: list[Stream], cameras: list[Stream]) -> Manifest:
         return new_manifest(
             name,
             start_monotonic_ns=self._start_ns,
@@ -275,7 +168,7 @@ class Take:
             rig=rig.source,
         )
 
-    def _device_summary(self, stream: _Stream) -> DeviceSummary:
+    def _device_summary(self, stream: Stream) -> DeviceSummary:
         driver = self._drivers[stream.device.name]
         return DeviceSummary(
             driver=stream.device.config.driver,
@@ -509,7 +402,7 @@ def suspended_ns() -> int:
     return min(readings)[1]
 
 
-def _in_take(stream: _Stream, driver: Driver, cameras: list[_Stream]) -> DeviceInTake:
+def _in_take(stream: Stream, driver: Driver, cameras: list[Stream]) -> DeviceInTake:
     return DeviceInTake(
         name=stream.name,
         config=stream.device.config,
@@ -521,7 +414,7 @@ def _in_take(stream: _Stream, driver: Driver, cameras: list[_Stream]) -> DeviceI
     )
 
 
-def _half_period_ns(cameras: list[_Stream]) -> int:
+def _half_period_ns(cameras: list[Stream]) -> int:
     rates_hz = [camera.spec.rate_hz or 30.0 for camera in cameras]
     return round(0.5 * NS_PER_S / max(rates_hz, default=30.0))
 

@@ -16,13 +16,14 @@ import pytest
 import recorder.session
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.samples import Chunk, DeviceEvent, FrameSample, ImuSample, LostFrame, PoseSample, Received
-from recorder.errors import ConfigError, StorageError, StorageFullError
+from recorder.errors import ConfigError, RecorderError, StorageError, StorageFullError
 from recorder.pipeline import Pipeline
+from recorder.preparation import DevicesMissingError
 from recorder.recording.check import check
 from recorder.recording.manifest import hash_file, read_manifest
 from recorder.recording.raw import read_clock_table
 from recorder.rig import Rig, RigDevice
-from recorder.session import DevicesMissingError, record
+from recorder.session import record
 from recorder.skews import Skew, SkewStore
 
 MS = 1_000_000
@@ -539,7 +540,7 @@ def test_a_stop_before_the_take_began_records_nothing(bench):
     stop = threading.Event()
     stop.set()
     driver = bench.add("imu", imu_act(10))
-    with pytest.raises(recorder.session.RecorderError, match="nothing was recorded"):
+    with pytest.raises(RecorderError, match="nothing was recorded"):
         bench.record(stop=stop)
     assert list(bench.out.iterdir()) == []
     assert driver.closed
