@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from threading import Event
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import msgspec
 
@@ -30,12 +30,15 @@ class DeviceConfig(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, fro
     required: without it the take does not start; a device that is not required is picked up when it appears.
     clock: name of the clock that stamps this device; devices with one name share one clock map (default: own).
     latency_s: known fixed time between the event and the earliest arrival of its message, subtracted after mapping.
+    level: where the stamps given while recording lie above the unknown least delay of a polled link: by the quickest
+    arrivals, or by the fitted law of the delays.
     """
 
     driver: str
     required: bool = True
     clock: str = ""
     latency_s: float = 0.0
+    level: Literal["lowest", "model"] = "lowest"
 
 
 @dataclass(frozen=True, slots=True)

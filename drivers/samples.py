@@ -142,16 +142,26 @@ class ScanSample:
 class ClockPairs:
     """Device ticks and host arrival of many messages that are no samples of their own (lidar packets).
 
-    ticks, arrival_ns: (n,) int64. sent_ns: when the queries that these are answers to were sent, (n,) int64; with
-    them the least delay of the link becomes known.
+    ticks, arrival_ns: (n,) int64.
     """
 
     ticks: npt.NDArray[np.int64]
     arrival_ns: npt.NDArray[np.int64]
-    sent_ns: npt.NDArray[np.int64] | None = None
 
 
-Sample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample | ClockPairs
+@dataclass(frozen=True, slots=True)
+class TwoWayPair:
+    """Device time known to lie between two host times: a query and its answer, or the device's own synchronisation.
+
+    It tells the least delay of the link, which arrivals alone cannot.
+    """
+
+    device_ticks: int
+    not_before_ns: int
+    not_after_ns: int
+
+
+Sample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample | ClockPairs | TwoWayPair
 
 
 @dataclass(frozen=True, slots=True)

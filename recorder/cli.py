@@ -20,6 +20,7 @@ from recorder import simulation
 from recorder.cli_calibrate import calibrate
 from recorder.cli_common import Folder, RigFile, clear_errors, stop_on_signals
 from recorder.cli_formats import export, import_
+from recorder.clock_fit import Level
 from recorder.decode import decode as decode_capture
 from recorder.errors import RecorderError
 from recorder.recording.check import check as check_recording
@@ -114,13 +115,13 @@ def record(
         sys.exit(1)
 
 
-def _refine(folder: Path, out: Path | None, console: Console) -> None:
+def _refine(folder: Path, out: Path | None, console: Console, level: Level = "model") -> None:
     """Refine the times of a recording, and tell by how much they moved."""
     begun_s = time.monotonic()
     errors = Console(stderr=True)
     with Progress(console=errors, transient=True, disable=not errors.is_terminal) as bar:
         task = bar.add_task("refining the times", total=1.0)
-        manifest = resync_recording(folder, out, lambda done: bar.update(task, completed=done))
+        manifest = resync_recording(folder, out, lambda done: bar.update(task, completed=done), level)
     print_refinement(console, manifest, time.monotonic() - begun_s)
 
 
@@ -281,8 +282,15 @@ def recover(verbose: bool, recording: Path) -> None:
 @main.command()
 @click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("-o", "--output", type=Folder, help="New folder for the refined recording (default: in place).")
+@click.option(
+    "--level",
+    type=click.Choice(["lowest", "model"]),
+    default="model",
+    show_default=True,
+    help="Where times lie on polled links: by the quickest arrival, or by the fitted law of the delays.",
+)
 @click.pass_obj
-def resync(verbose: bool, recording: Path, output: Path | None) -> None:
+def resync(verbose: bool, recording: Path, output: Path | None, level: Level) -> None:
     """Refine the times of a recording by all that is known after its end.
 
     While recording, a stamp can only use what has come so far; now each one uses the arrivals before and after it.
@@ -297,7 +305,7 @@ def resync(verbose: bool, recording: Path, output: Path | None) -> None:
     """
     console = Console()
     with clear_errors(verbose):
-        _refine(recording, output, console)
+        _refine(recording, output, console, level)
     console.print(f"next: rigtape check {output or recording}", soft_wrap=True)
 
 

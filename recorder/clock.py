@@ -18,13 +18,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Literal, overload
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock_estimator import KEPT_SKEW_PPM, LATE_NS, Estimator, Ints, S
-from recorder.clock_fit import PPM, Floats, SlopePrior
+from recorder.clock_fit import PPM, Floats, Level, SlopePrior
 from recorder.clock_grid import GridTracker
 from recorder.clock_refine import refine_epoch
 
@@ -393,7 +393,7 @@ class ClockMap:
         prior_skew_ppm: float = 0.0,
         prior_sigma_ppm: float = 100.0,
         inline_refit: bool = True,
-        level: Literal["lowest", "model"] = "lowest",
+        level: Level = "lowest",
         use_grid: bool = True,
     ):
         prior = SlopePrior(1 / (1 + prior_skew_ppm * PPM) - 1, max(prior_sigma_ppm, 1e-3) * PPM)
@@ -403,6 +403,11 @@ class ClockMap:
         self._stream = ClockStream(estimator, tick_hz, wrap_bits, self._streams)
         self.map = self._stream.map
         self._two_way: list[tuple[int, int]] = []  # round trip, stamp minus its middle
+
+    @property
+    def level(self) -> Level:
+        """How stamps are placed above the unknown floor."""
+        return self._estimator.level
 
     def stream(self, tick_hz: float, wrap_bits: int = 0) -> ClockStream:
         """Another stream of the same device clock, with ticks of its own."""
@@ -564,8 +569,8 @@ def refine(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0) ->
     return refine_all(ticks, arrival_ns, tick_hz, wrap_bits).host_ns
 
 
-def refine_all(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0) -> Refinement:
-    """`refine` with its uncertainty. The sync epochs of the recording share a skew."""
+def refine_all(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0, level: Level = "model") -> Refinement:
+    """`refine` with its uncertainty. The sync epochs of the recording share a skew; level: as in ClockMap."""
     ticks, arrival_ns = np.asarray(ticks, dtype=np.int64), np.asarray(arrival_ns, dtype=np.int64)
     device_ns, epochs, plain = _unwrap_all(ticks, arrival_ns, tick_hz, wrap_bits)
     host_ns, sigma_ns = arrival_ns.copy(), np.zeros(ticks.size)
@@ -580,7 +585,7 @@ def refine_all(ticks: Ints, arrival_ns: Ints, tick_hz: float, wrap_bits: int = 0
         anchor_device, anchor_host = device_ns[learn[0]], arrival_ns[learn[0]]
         x = (device_ns[learn] - anchor_device).astype(np.float64)
         y = (arrival_ns[learn] - anchor_host).astype(np.float64) - x
-        curve = refine_epoch(x, y, prior)
+        curve = refine_epoch(x, y, prior, level)
         ahead = device_ns[chosen] - anchor_device
         half_tick_ns = _half_tick_ns(device_ns[learn], S / tick_hz)
         offset = curve.at(ahead.astype(np.float64)) + half_tick_ns

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_fit import PPM, Bucket, Floats, Line, SlopePrior, blend, summarise
+from recorder.clock_fit import PPM, Bucket, Floats, Level, Line, SlopePrior, blend, summarise
 from recorder.clock_grid import GridTracker
 from recorder.clock_polling import GridLine, PollingGrid
 
@@ -91,7 +91,7 @@ class Counts:
     epochs: int = 0
 
 
-def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: str, now_x: float) -> Line:
+def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now_x: float) -> Line:
     """The tangent at `now_x` of the grid's curve and the line beneath, mixed by trust.
 
     level "lowest": the curve is moved to touch the lowest point, but not further above the place where the delay law
@@ -125,7 +125,7 @@ class Estimator:
     Calls must not overlap, but `refit` may run in another thread than the rest.
     """
 
-    def __init__(self, prior: SlopePrior, inline_refit: bool, level: str = "lowest", use_grid: bool = True):
+    def __init__(self, prior: SlopePrior, inline_refit: bool, level: Level = "lowest", use_grid: bool = True):
         self.level = level
         self.grid = PollingGrid() if use_grid else None
         self.grid_line: GridLine | None = None

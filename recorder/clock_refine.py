@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_fit import LEVEL, Floats, SlopePrior, hull_slope, touching_error
+from recorder.clock_fit import LEVEL, Floats, Level, SlopePrior, hull_slope, touching_error
 from recorder.clock_grid import LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
 from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, without_late
 
@@ -227,14 +227,15 @@ def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoi
     return fitness.trust * ramp(fitness.load, 0.02, 0.04)
 
 
-def refine_epoch(x: Floats, y: Floats, prior: SlopePrior | None = None) -> Curve:
+def refine_epoch(x: Floats, y: Floats, prior: SlopePrior | None = None, level: Level = "model") -> Curve:
     """The curve of one sync epoch from its samples in ascending order; a long one piece by piece.
 
-    prior: the slope as other epochs of the same clock tell it.
+    prior: the slope as other epochs of the same clock tell it. level: where the polls' curve lies, by the fitted law
+    of the delays, or moved onto the lowest arrival.
     """
     pieces = min(int((x[-1] - x[0]) / (PIECE_S * S)), x.size // 1000) + 1
     if pieces == 1:
-        return _refine_piece(x, y, prior)
+        return _refine_piece(x, y, prior, level)
     edges = np.linspace(x[0], x[-1], pieces + 1)
     knots_x = np.arange(x[0], x[-1] + SEAM_S * S, 0.1 * SEAM_S * S)
     heights, weights = np.zeros_like(knots_x), np.zeros_like(knots_x)
@@ -245,19 +246,22 @@ def refine_epoch(x: Floats, y: Floats, prior: SlopePrior | None = None) -> Curve
             continue
         inside = np.minimum(knots_x - left, right - knots_x) / (SEAM_S * S) + 1
         weight = np.clip(0.5 * inside, 1e-9, 1.0)
-        curve = _refine_piece(x[part], y[part], prior)
+        curve = _refine_piece(x[part], y[part], prior, level)
         heights += weight * curve.at(knots_x)
         weights += weight
         sigmas.append(curve.sigma_ns)
     return Curve(knots_x, heights / weights, max(sigmas))
 
 
-def _refine_piece(x: Floats, y: Floats, prior: SlopePrior | None) -> Curve:
+def _refine_piece(x: Floats, y: Floats, prior: SlopePrior | None, level: Level) -> Curve:
     beneath = envelope_by_data(x, y, prior)
     found = grid_curve(x, y, beneath, prior)
     if found is None:
         return beneath
     curve, trust, hidden_ns = found
+    if level == "lowest":
+        raised = curve.heights + float((y - curve.at(x)).min())
+        curve = Curve(curve.knots_x, raised, math.hypot(beneath.sigma_ns, hidden_ns))
     beneath = replace(beneath, sigma_ns=math.hypot(beneath.sigma_ns, hidden_ns))
     knots_x = np.union1d(curve.knots_x, beneath.knots_x)
     heights = trust * curve.at(knots_x) + (1 - trust) * beneath.at(knots_x)

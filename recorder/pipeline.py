@@ -22,6 +22,7 @@ from drivers.samples import (
     PoseSample,
     Sample,
     ScanSample,
+    TwoWayPair,
 )
 from drivers.serial_ports import usb_controller
 from recorder.clock import ClockMap
@@ -104,9 +105,15 @@ class Pipeline:
         self._devices = {device.name: device for device in devices}
         self._timebase = Timebase(start_ns, inline_refit=inline_refit)
         for device in devices:
-            latency_ns = round(device.config.latency_s * NS_PER_S)
-            prior = device.prior_skew_ppm
-            self._timebase.add_device(device.name, device.clock, device.tick_hz, device.wrap_bits, latency_ns, prior)
+            self._timebase.add_device(
+                device.name,
+                device.clock,
+                device.tick_hz,
+                device.wrap_bits,
+                round(device.config.latency_s * NS_PER_S),
+                device.prior_skew_ppm,
+                device.config.level,
+            )
         cameras = sorted((device.camera, device.clock) for device in devices if device.camera is not None)
         clocks = list(dict.fromkeys(clock for _, clock in cameras))
         group_of = tuple(clocks.index(clock) for _, clock in cameras)
@@ -143,7 +150,7 @@ class Pipeline:
             none = np.full(sample.ticks.size, NONE, np.int64)
             self._judge_clock(device, sample)
             self._tables[device].batches.append(np.column_stack((sample.ticks, sample.arrival_ns, none)))
-        else:
+        elif not isinstance(sample, TwoWayPair):
             self._devices[device].summary.received += 1
         self._heard.add(self._devices[device].clock)
         self._timebase.take(device, arrival_ns, sample)
@@ -235,7 +242,8 @@ class Pipeline:
             if name not in self._heard:
                 continue
             skew_ppm, uncertainty_us = round(clock.skew_ppm, 4), round(clock.uncertainty_ns / 1e3, 3)
-            self._writer.write_clock(ClockState(time_s, name, clock.epoch, skew_ppm, uncertainty_us))
+            state = ClockState(time_s, name, clock.epoch, skew_ppm, uncertainty_us, *_floor_us(clock))
+            self._writer.write_clock(state)
             epochs = self._epochs.setdefault(name, [])
             if not epochs or epochs[-1].epoch != clock.epoch:
                 if len(epochs) >= MAX_EPOCHS_KEPT:
@@ -306,7 +314,15 @@ class Pipeline:
         return {name: (clock.skew_ppm, clock.skew_sigma_ppm) for name, clock in self._timebase.clocks().items()}
 
 
+def _floor_us(clock: ClockMap) -> tuple[float | None, float | None]:
+    """The least delay of the link and its bound, as two-way pairs tell them."""
+    if clock.floor_ns is None or clock.floor_bound_ns is None:
+        return None, None
+    return clock.floor_ns / 1e3, clock.floor_bound_ns / 1e3
+
+
 def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int, epochs: list[EpochSummary]) -> ClockSummary:
+    floor_us, floor_bound_us = _floor_us(clock)
     return ClockSummary(
         tick_hz=tick_hz,
         wrap_bits=wrap_bits,
@@ -317,7 +333,9 @@ def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int, epochs: list
         resets=clock.resets,
         wraps=clock.wraps,
         by_epoch=epochs,
-        floor_us=None if clock.floor_ns is None else clock.floor_ns / 1e3,
+        floor_us=floor_us,
+        floor_bound_us=floor_bound_us,
+        level=clock.level,
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recorder.clock import refine_all
+from recorder.clock_fit import Level
 from recorder.recording.manifest import NS_PER_S
 from recorder.recording.raw import NONE
 
@@ -104,7 +105,7 @@ def _thinned(rows: Ints, has_arrival: npt.NDArray[np.bool_], tick_hz: float) -> 
     return keep
 
 
-def refine_tables(tables: list[DeviceTable], start_ns: int) -> list[Refined]:
+def refine_tables(tables: list[DeviceTable], start_ns: int, level: Level = "model") -> list[Refined]:
     """Refine the devices of one clock: together, or in groups that do not count from the same zero."""
     axes = {table.device: _axis_ns(table.heard, table.tick_hz, table.wrap_bits) for table in tables}
     groups: list[list[DeviceTable]] = []
@@ -116,7 +117,7 @@ def refine_tables(tables: list[DeviceTable], start_ns: int) -> list[Refined]:
         else:
             groups.append([table])
     split = [part for group in groups for part in _alike(group, axes)]
-    return [_refine_group(group, axes, start_ns) for group in split]
+    return [_refine_group(group, axes, start_ns, level) for group in split]
 
 
 def _alike(group: list[DeviceTable], axes: dict[str, Ints]) -> list[list[DeviceTable]]:
@@ -162,7 +163,7 @@ def _put_on_axis(table: DeviceTable, axes: dict[str, Ints], other: DeviceTable) 
     return abs(apart_ns) < SAME_ZERO_NS
 
 
-def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int) -> Refined:
+def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int, level: Level) -> Refined:
     axis = np.concatenate([axes[table.device] for table in group])
     arrival_ns = np.concatenate([table.heard[:, 1] - table.latency_ns for table in group])
     order = np.arange(axis.size)
@@ -173,7 +174,7 @@ def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int
     if axis.size:
         in_order = axis[order]
         is_first = np.diff(in_order, prepend=in_order[0] - 1) != 0  # of several messages of one instant, the quickest
-        refined = refine_all(in_order[is_first], arrival_ns[order][is_first], NS_PER_S)
+        refined = refine_all(in_order[is_first], arrival_ns[order][is_first], NS_PER_S, level=level)
         host_ns[order] = refined.host_ns[np.cumsum(is_first) - 1]
         sigma_ns = float(np.sqrt(np.mean(refined.sigma_ns**2)))
     curves = _curves(axis[order], host_ns[order])

@@ -12,6 +12,7 @@ The order of samples of one stream never changes, so pictures stay in step with 
 """
 
 import heapq
+import math
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
@@ -25,6 +26,7 @@ import msgspec
 import numpy as np
 
 from drivers.samples import POINT_DTYPE
+from recorder.clock_fit import Level
 from recorder.errors import StorageError, StorageFullError
 from recorder.recording.check_data import path_inside
 from recorder.recording.folder import free_bytes, link_or_copy, low_water_bytes
@@ -59,13 +61,18 @@ FIRST_LINES = 5000
 Progress = Callable[[float], None]
 
 
-def resync(folder: Path, out: Path | None = None, progress: Progress = lambda done: None) -> Manifest:
+def resync(
+    folder: Path, out: Path | None = None, progress: Progress = lambda done: None, level: Level = "model"
+) -> Manifest:
     """Refine the times of a recording, in place or into `out`, which must be empty or not there.
 
-    Gives the manifest as written. In place a recording that was refined already stays as it is. Raises StorageError.
+    level: where the times lie on polled links, as in `refine_all`. Gives the manifest as written. In place a recording
+    that was refined already stays as it is. Raises StorageError.
     """
     manifest = _complete_manifest(folder)
     was = manifest.resync
+    if out is None and was is not None and was.level != level:
+        raise StorageError(f"{folder}: its times were refined with level {was.level}; choose another folder with -o")
     if out is None and was is not None and was.state == "done":
         progress(1.0)
         return manifest
@@ -77,7 +84,7 @@ def resync(folder: Path, out: Path | None = None, progress: Progress = lambda do
         if resumed and was is not None:
             times_ns, summary = former, was
         else:
-            times_ns, summary = _refine(tables, manifest)
+            times_ns, summary = _refine(tables, manifest, level)
         _set_utc(manifest, tables, times_ns, summary)
         target = _Target(folder, out)
         rewriting = _Rewriting(folder, target, manifest, tables, times_ns, former)
@@ -135,7 +142,7 @@ def _tables(folder: Path, manifest: Manifest) -> dict[str, DeviceTable]:
     return tables
 
 
-def _refine(tables: dict[str, DeviceTable], manifest: Manifest) -> tuple[dict[str, Ints], Resync]:
+def _refine(tables: dict[str, DeviceTable], manifest: Manifest, level: Level) -> tuple[dict[str, Ints], Resync]:
     """Refined times of all stamped rows by device, and what to say of them."""
     clocks: dict[str, list[DeviceTable]] = {}
     for name, table in tables.items():
@@ -143,16 +150,19 @@ def _refine(tables: dict[str, DeviceTable], manifest: Manifest) -> tuple[dict[st
     times_ns: dict[str, Ints] = {}
     summaries: dict[str, ClockRefinement] = {}
     for clock, members in clocks.items():
-        for refined in refine_tables(members, manifest.start_monotonic_ns):
+        for refined in refine_tables(members, manifest.start_monotonic_ns, level):
             times_ns |= refined.times_ns
             name = clock if clock not in summaries else f"{clock} ({', '.join(refined.times_ns)})"
-            summaries[name] = _summary(refined, tables)
+            known = manifest.clocks.get(clock)
+            bound_us = (known.floor_bound_us or 0.0) if known else 0.0
+            summaries[name] = _summary(refined, tables, bound_us)
     return times_ns, Resync(
         state="running",
         method=METHOD,
         at_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         version=version("rigtape"),
         clocks=summaries,
+        level=level,
     )
 
 
@@ -169,7 +179,7 @@ def _set_utc(manifest: Manifest, tables: dict[str, DeviceTable], times_ns: dict[
                 return
 
 
-def _summary(refined: Refined, tables: dict[str, DeviceTable]) -> ClockRefinement:
+def _summary(refined: Refined, tables: dict[str, DeviceTable], floor_bound_us: float) -> ClockRefinement:
     parts = []
     for device, times in refined.times_ns.items():
         online_ns = tables[device].stamped[:, 2]
@@ -181,7 +191,7 @@ def _summary(refined: Refined, tables: dict[str, DeviceTable]) -> ClockRefinemen
         devices=list(refined.times_ns),
         epochs=refined.epochs,
         skew_ppm=round(refined.skew_ppm, 4),
-        uncertainty_us=round(refined.uncertainty_ns / 1e3, 3),
+        uncertainty_us=round(math.hypot(refined.uncertainty_ns / 1e3, floor_bound_us / math.sqrt(3)), 3),
         shift_mean_us=round(float(shifts_us.mean()), 3),
         shift_rms_us=round(float(np.sqrt(np.mean(shifts_us**2))), 3),
         shift_min_us=round(float(shifts_us.min()), 3),

@@ -76,6 +76,7 @@ def parse_rig(text: str, origin: str, folder: Path, settings: tuple[str, ...] = 
         raise ConfigError(f"{origin}: raw: must be true or false")
     made = tuple(_device(name, entry, origin) for name, entry in devices.items())
     _check_values(source, "", origin)
+    _check_levels(made, origin)
     return Rig(
         name=str(source.get("name", "rig")),
         devices=made,
@@ -161,6 +162,16 @@ def _device(name: object, entry: object, origin: str) -> RigDevice:
         key_path = where + place.rstrip("`")
         raise ConfigError(f"{origin}: {key_path}: {message}") from error
     return RigDevice(name, driver, config)
+
+
+def _check_levels(devices: tuple[RigDevice, ...], origin: str) -> None:
+    """Devices on one clock have one line, so they cannot ask for different ones."""
+    first: dict[str, RigDevice] = {}
+    for device in devices:
+        other = first.setdefault(device.clock, device)
+        if device.config.level != other.config.level:
+            text = f"is {device.config.level}, but {other.name}, on the same clock, has {other.config.level}"
+            raise ConfigError(f"{origin}: devices.{device.name}.level: {text}")
 
 
 def _video(entry: object, origin: str) -> VideoSettings:

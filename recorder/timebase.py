@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from drivers.samples import ClockPairs, Sample, ScanSample
+from drivers.samples import ClockPairs, Sample, ScanSample, TwoWayPair
 from recorder.clock import ClockMap, ClockStream
+from recorder.clock_fit import Level
 from recorder.clock_grid import GridTracker
 
 HOLD_AT_START_NS = 1_000_000_000
@@ -84,8 +85,12 @@ class Timebase:
         wrap_bits: int,
         latency_ns: int,
         prior_skew_ppm: tuple[float, float] | None = None,
+        level: Level = "lowest",
     ) -> None:
-        """Announce a device and the clock that stamps it. prior_skew_ppm: its skew and sigma, where known before."""
+        """Announce a device and the clock that stamps it.
+
+        prior_skew_ppm: its skew and sigma, where known before. level: as in ClockMap; that of a clock's first device.
+        """
         if clock not in self._clocks:
             skew_ppm, sigma_ppm = prior_skew_ppm or (0.0, UNKNOWN_SKEW_PPM)
             clock_map = ClockMap(
@@ -94,6 +99,7 @@ class Timebase:
                 prior_skew_ppm=skew_ppm,
                 prior_sigma_ppm=sigma_ppm,
                 inline_refit=self._inline_refit,
+                level=level,
             )
             self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS)
         shared = self._clocks[clock]
@@ -144,11 +150,9 @@ class Timebase:
         arrival_ns -= entry.latency_ns
         if isinstance(sample, ClockPairs):
             entry.stream.observe_many(sample.ticks, sample.arrival_ns - entry.latency_ns)
-            if sample.sent_ns is not None:
-                for pair in zip(
-                    sample.ticks.tolist(), sample.sent_ns.tolist(), sample.arrival_ns.tolist(), strict=True
-                ):
-                    clock.map.observe_two_way(*pair, stream=entry.stream)
+        elif isinstance(sample, TwoWayPair):
+            bounds_ns = sample.not_before_ns, sample.not_after_ns
+            clock.map.observe_two_way(sample.device_ticks, *bounds_ns, stream=entry.stream)
         elif isinstance(sample, ScanSample):
             clock.waiting.append((entry, entry.stream.unwrap(sample.last_ticks), arrival_ns, sample))
         elif sample.device_ticks is None:

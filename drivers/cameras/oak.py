@@ -22,7 +22,7 @@ from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
 from drivers.links import SILENCE_S
-from drivers.samples import DeviceEvent, Received
+from drivers.samples import DeviceEvent, Received, TwoWayPair
 
 try:
     from drivers.cameras.oak_environment import dai
@@ -36,6 +36,9 @@ WAIT = timedelta(milliseconds=100)
 SILENT_PERIODS = 3
 BYTES_PER_PIXEL = {"h264": 0.15, "h265": 0.1, "mjpeg": 0.4, "raw": 0.3}  # generous; the disk check uses it
 SYNC_JUDGED_AFTER_S = 20.0
+SYNC_EVERY_NS = 1_000_000_000
+SYNC_BOUND_NS = {"TCP": 870_000, "USB": 350_000}  # uniform within these is Luxonis' 0.5 and 0.2 ms, one sigma
+SYNC_MOST_NS = 100_000_000  # a host time further off is none: the device has not yet synchronised
 CODED_WIDTH_STEP = 32
 MAX_CODED_PIXELS_PER_S = 248e6
 
@@ -181,7 +184,7 @@ class _Reader:
         self._started_s = time.monotonic()
         self._heard_s = dict.fromkeys(link.queues, 0.0)
         self._silent: set[str] = set()
-        self._sync = _OwnSync()
+        self._sync = _OwnSync(config.latency_s, link.facts.get("connection", ""), self._imu.streams[0])
 
     def opening(self) -> Received:
         """What is known of the device before anything is read.
@@ -205,9 +208,9 @@ class _Reader:
                     yield from self._imu.feed(arrival_ns, message)
                 else:
                     yield self._cameras[name].feed(arrival_ns, message)
-        if self._imu.newest_host_ns:
-            yield from self._sync.judge(arrival_ns, self._imu.newest_host_ns, self._config.latency_s)
-            self._imu.newest_host_ns = 0
+        if self._imu.newest:
+            yield from self._sync.judge(arrival_ns, *self._imu.newest)
+            self._imu.newest = None
         yield from self._watch(arrival_ns * 1e-9)
 
     def _waiting(self, name: str) -> list[Any]:
@@ -236,28 +239,43 @@ class _OwnSync:
     """Compares arrivals with the host times that depthai's own time synchronisation gives.
 
     These are no arrivals, as they may lie before the event and step back, but they tell what arrivals cannot: the
-    least time that messages take (to about 0.2 ms over USB, 0.5 ms over PoE by Luxonis).
+    least time that messages take (to about 0.2 ms over USB, 0.5 ms over PoE by Luxonis). Unless that is configured,
+    they go to the clock map as bounds from both sides.
     """
 
-    def __init__(self) -> None:
-        self._begin_ns = 0
+    def __init__(self, latency_s: float, connection: str, stream: int) -> None:
+        self._latency_s = latency_s
+        self._bound_ns = SYNC_BOUND_NS["TCP" if connection == "TCP" else "USB"]
+        self._stream = stream
+        self._begin_ns = self._next_ns = 0
         self._least_ns: int | None = None
         self._told = False
 
-    def judge(self, arrival_ns: int, host_ns: int, latency_s: float) -> Iterator[Received]:
-        """Take the newest reading's times; tell once what is found."""
+    def judge(self, arrival_ns: int, host_ns: int, device_ns: int) -> Iterator[Received]:
+        """Take the newest reading's times; each second hand them on, and tell once what is found."""
         self._begin_ns = self._begin_ns or arrival_ns
-        if self._told:
-            return
         delay_ns = arrival_ns - host_ns
+        if not -self._bound_ns < delay_ns < SYNC_MOST_NS:
+            return
+        samples: tuple[tuple[int, TwoWayPair], ...] = ()
+        if not self._latency_s and arrival_ns >= self._next_ns:
+            self._next_ns = arrival_ns + SYNC_EVERY_NS
+            samples = ((arrival_ns, TwoWayPair(device_ns, host_ns - self._bound_ns, host_ns + self._bound_ns)),)
+        events = self._tell(arrival_ns, delay_ns)
+        if samples or events:
+            yield Received(samples=samples, events=events, stream=self._stream)
+
+    def _tell(self, arrival_ns: int, delay_ns: int) -> tuple[DeviceEvent, ...]:
         self._least_ns = delay_ns if self._least_ns is None else min(self._least_ns, delay_ns)
-        if (arrival_ns - self._begin_ns) * 1e-9 > SYNC_JUDGED_AFTER_S:
-            self._told = True
-            text = (
-                f"by the device's own time synchronisation IMU readings take {self._least_ns * 1e-6:.2f} ms or more "
-                f"to arrive; configured is latency_s: {latency_s:g}"
-            )
-            yield Received(events=(DeviceEvent("info", text),))
+        if self._told or (arrival_ns - self._begin_ns) * 1e-9 <= SYNC_JUDGED_AFTER_S:
+            return ()
+        self._told = True
+        use = f"configured is latency_s: {self._latency_s:g}" if self._latency_s else "that is taken off all stamps"
+        text = (
+            f"by the device's own time synchronisation IMU readings take {self._least_ns * 1e-6:.2f} ms or more "
+            f"to arrive; {use}"
+        )
+        return (DeviceEvent("info", text),)
 
 
 def _backend(name: str) -> Callable[[OakConfig], OakLink]:

@@ -191,11 +191,11 @@ class ImuDecoder:
     """The readings of accelerometer and gyroscope, each with its own times and numbers.
 
     streams: index of the accelerometer's and of the gyroscope's stream. newest: host time of the newest reading as
-    depthai's own time synchronisation has it, ns.
+    depthai's own time synchronisation has it, and its device time, ns.
     """
 
     streams: tuple[int, int]
-    newest_host_ns: int = 0
+    newest: tuple[int, int] | None = None
     _accel: Numbering = field(default_factory=lambda: Numbering("accelerometer readings"))
     _gyro: Numbering = field(default_factory=lambda: Numbering("gyroscope readings"))
 
@@ -222,7 +222,8 @@ class ImuDecoder:
                 gyro_events += self._gyro.gap_before(number, ticks)
                 gyro.append((arrival_ns, ImuSample(number, ticks, None, (report.x, report.y, report.z))))
         for report in (packet.acceleroMeter, packet.gyroscope) if message.packets else ():
-            self.newest_host_ns = max(self.newest_host_ns, nanoseconds(report.getTimestamp()))
+            if _ticks(report):
+                self.newest = max(self.newest or (0, 0), (nanoseconds(report.getTimestamp()), _ticks(report)))
         return [
             Received(samples=tuple(accel), events=accel_events, stream=self.streams[0]),
             Received(samples=tuple(gyro), events=gyro_events, stream=self.streams[1]),

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from recorder.clock_fit import Level
 from recorder.errors import StorageError
 
 MANIFEST_NAME = "recording.json"
@@ -58,7 +59,8 @@ class DeviceSummary(msgspec.Struct):
 class ClockState(msgspec.Struct):
     """A line of raw/clocks.jsonl: one clock as known at a time of the take.
 
-    uncertainty_us: one sigma of the stamps given then, apart from the constant least delay of the link.
+    uncertainty_us: one sigma of the stamps given then, apart from the constant least delay of the link, unless that is
+    known: floor_us and floor_bound_us as in ClockSummary.
     """
 
     time: float
@@ -66,6 +68,8 @@ class ClockState(msgspec.Struct):
     epoch: int
     skew_ppm: float
     uncertainty_us: float
+    floor_us: float | None = None
+    floor_bound_us: float | None = None
 
 
 class EpochSummary(msgspec.Struct):
@@ -81,7 +85,8 @@ class EpochSummary(msgspec.Struct):
 class ClockSummary(msgspec.Struct):
     """One device clock as the clock map saw it at the end.
 
-    floor_us: the least delay of its link where two-way pairs told it; it is taken off the stamps.
+    floor_us: the least delay of its link where two-way pairs told it; it is taken off the stamps. floor_bound_us: it is
+    not further off than this. level: where the stamps lie on a polled link (see ClockMap).
     """
 
     tick_hz: float
@@ -94,6 +99,8 @@ class ClockSummary(msgspec.Struct):
     wraps: int
     by_epoch: list[EpochSummary] = []
     floor_us: float | None = None
+    floor_bound_us: float | None = None
+    level: Level = "lowest"
 
 
 class UtcAtZero(msgspec.Struct):
@@ -135,7 +142,8 @@ class Resync(msgspec.Struct):
     """How the times were refined after the take.
 
     state: running while it is done in place (and after it was cut short: resync again finishes it). lines: of
-    data.jsonl; kept: of these, with their online time, as no clock is known for them.
+    data.jsonl; kept: of these, with their online time, as no clock is known for them. level: where the times lie on a
+    polled link.
     """
 
     state: Literal["running", "done"]
@@ -145,6 +153,7 @@ class Resync(msgspec.Struct):
     clocks: dict[str, ClockRefinement]
     lines: int = 0
     kept: int = 0
+    level: Level = "model"
 
 
 class FileEntry(msgspec.Struct):

@@ -98,12 +98,14 @@ def _count_lines(folder: Path, manifest: Manifest, stream: str, times_ns: Ints) 
 def _clocks(folder: Path, manifest: Manifest) -> dict[str, ClockSummary]:
     """The clocks as they were last logged."""
     epochs: dict[str, list[EpochSummary]] = {}
+    floors: dict[str, tuple[float | None, float | None]] = {}
     for state in _read(folder / CLOCK_LOG_NAME, ClockState):
         known = epochs.setdefault(state.clock, [])
         if not known or known[-1].epoch != state.epoch:
             known.append(EpochSummary(state.epoch, state.time, state.time, state.skew_ppm, state.uncertainty_us))
         last = known[-1]
         last.until_s, last.skew_ppm, last.uncertainty_us = state.time, state.skew_ppm, state.uncertainty_us
+        floors[state.clock] = state.floor_us, state.floor_bound_us
     clocks = {}
     for name, found in epochs.items():
         device = next((device for device in manifest.devices.values() if device.clock == name), None)
@@ -118,6 +120,8 @@ def _clocks(folder: Path, manifest: Manifest) -> dict[str, ClockSummary]:
             resets=0,
             wraps=0,
             by_epoch=found,
+            floor_us=floors[name][0],
+            floor_bound_us=floors[name][1],
         )
     return clocks
 

@@ -19,7 +19,7 @@ from drivers.cameras.oak import DRIVER, OakConfig
 from drivers.cameras.oak_environment import dai
 from drivers.cameras.oak_messages import ImuDecoder, PictureDecoder
 from drivers.device import DeviceError, received
-from drivers.samples import FrameSample, ImuSample, LostFrame
+from drivers.samples import FrameSample, ImuSample, LostFrame, TwoWayPair
 
 PERIOD_US = 33_333
 SPS_PPS = bytes.fromhex("0000000167420029e29014000000000168ce3880")
@@ -410,13 +410,16 @@ def test_a_silent_device_is_given_up_and_a_silent_camera_is_told(links, monkeypa
     assert texts == [f"{name} sends nothing, while others do" for name in ("right", "imu")]
 
 
-def test_the_devices_own_time_synchronisation_is_told(links, monkeypatch):
+@pytest.mark.parametrize(
+    ("latency_s", "text", "pairs"), [(0.001, "latency_s: 0.001", 0), (0.0, "taken off all stamps", 25)]
+)
+def test_the_devices_own_time_synchronisation_is_told_and_used(links, monkeypatch, latency_s, text, pairs):
     now_ns = 10**9
     monkeypatch.setattr(oak, "time", SimpleNamespace(monotonic=lambda: now_ns * 1e-9, monotonic_ns=lambda: now_ns))
-    driver = DRIVER.create("oak", config(stereo=False, latency_s=0.001))
+    driver = DRIVER.create("oak", config(stereo=False, latency_s=latency_s))
     driver.connect()
     reading = driver.read(threading.Event())
-    texts = []
+    items = []
     next(reading)
     for index in range(25):
         now_ns = (10 + index) * 10**9
@@ -429,11 +432,15 @@ def test_the_devices_own_time_synchronisation_is_told(links, monkeypatch):
         packets[0].gyroscope = report
         message.packets = packets
         links[0].queues["imu"].send(message)
-        for _ in range(2):
-            texts += [event.text for event in next(reading).events if event.kind == "info"]
-    assert len(texts) == 1
-    assert "2.00 ms or more" in texts[0]
-    assert "latency_s: 0.001" in texts[0]
+        items += [next(reading) for _ in range(2 if latency_s else 3)]
+    (told,) = [event for item in items for event in item.events if event.kind == "info"]
+    assert "2.00 ms or more" in told.text
+    assert text in told.text
+    found = [sample for sample in samples(items) if isinstance(sample, TwoWayPair)]
+    assert len(found) == pairs
+    for index, pair in enumerate(found):
+        host_ns = (10 + index) * 10**9 - 2_000_000 - 100_000 * index
+        assert pair == TwoWayPair(10**9 + index, host_ns - 350_000, host_ns + 350_000)
 
 
 def test_backends_are_found_by_name():

@@ -9,11 +9,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from recorder.clock import ClockMap, refine, stored_sigma_ppm
+from recorder.clock import ClockMap, refine, refine_all, stored_sigma_ppm
+from recorder.clock_fit import Level
 from recorder.clock_grid import GridTracker
 
 BOOT_NS = 250_000 * 10**9
 MS = 1_000_000
+LEVELS: tuple[Level, ...] = ("lowest", "model")
 
 
 @dataclass
@@ -126,6 +128,15 @@ def test_polling_grid_gives_slope_and_level() -> None:
     assert with_grid < 60
     assert with_grid < 1.1 * without
     assert rms_us(refine(t.ticks, t.arrival_ns, 1e6), t, after_s=0.0) < 20
+
+
+def test_refined_times_lie_by_the_law_or_on_the_lowest_arrival() -> None:
+    t = trace(poll_ms=1.0, jitter_ms=0.7, duration_s=60.0, skew_ppm=-60.0)
+    above_us = {
+        level: float((t.arrival_ns - refine_all(t.ticks, t.arrival_ns, 1e6, level=level).host_ns).min()) / 1e3
+        for level in LEVELS
+    }
+    assert 0 <= above_us["lowest"] < 5 < above_us["model"] < 100
 
 
 @pytest.mark.parametrize("poll_ms", [1.0, 0.0])

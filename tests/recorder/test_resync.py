@@ -217,6 +217,14 @@ def test_in_place_the_old_stamps_are_kept(original, recording, tmp_path):
     assert {path: path.read_bytes() for path in recording.rglob("*") if path.is_file()} == again
 
 
+def test_the_level_is_recorded_and_changes_only_in_a_new_folder(recording, tmp_path):
+    assert resync(recording).resync.level == "model"
+    with pytest.raises(StorageError, match="refined with level model; choose another folder"):
+        resync(recording, level="lowest")
+    resync(recording, tmp_path / "lowest", level="lowest")
+    assert read_manifest(tmp_path / "lowest").resync.level == "lowest"
+
+
 def test_a_refined_recording_can_be_refined_into_another_folder_with_the_same_times(recording, tmp_path):
     resync(recording)
     resync(recording, tmp_path / "second")

@@ -100,7 +100,8 @@ DEVICE = "devices:\n  imu:\n    driver: port\n    port: a\n"
         ("nmae: walk\n" + DEVICE, "nmae: unknown key; allowed: calibration, devices, name, raw, simulate, video"),
         (
             DEVICE + "    prot: b\n",
-            "devices.imu.prot: unknown key; allowed: clock, driver, latency_s, mode, options, port, rate_hz, required",
+            "devices.imu.prot: unknown key; allowed: "
+            "clock, driver, latency_s, level, mode, options, port, rate_hz, required",
         ),
         ("devices: {imu: {driver: prot}}", "devices.imu.driver: no driver 'prot'; installed: broken, port"),
         ("devices: {imu: {port: a}}", "devices.imu.driver: no driver None; installed: broken, port"),
@@ -193,6 +194,11 @@ def test_keys_that_yaml_reads_as_something_else_are_named():
     """`on`, `yes`, `no` are truth values to YAML; the rig could not be written into recording.json."""
     assert fault(GOOD, "simulate={on: 1}") == "rig.yaml: simulate.True: a key must be text; quote it"
     assert fault(GOOD, "simulate.list=[1, {2020-01-01: 1}]").startswith("rig.yaml: simulate.list.1.2020-01-01: a key")
+
+
+def test_devices_of_one_clock_have_one_level():
+    text = "devices: {a: {driver: port, port: x, clock: m}, b: {driver: port, port: y, clock: m, level: model}}"
+    assert fault(text) == "rig.yaml: devices.b.level: is model, but a, on the same clock, has lowest"
 
 
 def test_logins_in_urls_do_not_go_into_the_recording():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.samples import POINT_DTYPE, ClockPairs, FixSample, ImuSample, ScanSample
+from drivers.samples import POINT_DTYPE, ClockPairs, FixSample, ImuSample, ScanSample, TwoWayPair
 from recorder.timebase import HOLD_AT_START_NS, HOLD_NS, Stamped, Timebase
 
 S = 1_000_000_000
@@ -307,8 +307,7 @@ def test_two_way_pairs_move_the_stamps_by_the_least_delay() -> None:
         event_ns = i * step_ns
         timebase.take("imu", event_ns + floor_ns, imu(event_ns // 1000))
         if i % 200 == 100:
-            answers = np.array([event_ns // 1000]), np.array([event_ns + 3 * MS]), np.array([event_ns - 3 * MS])
-            timebase.take("imu", event_ns + 3 * MS, ClockPairs(*answers))
+            timebase.take("imu", event_ns, TwoWayPair(event_ns // 1000, event_ns - 3 * MS, event_ns + 3 * MS))
         stamped += timebase.release(event_ns + floor_ns)
     late_us = np.array([(s.host_ns - s.device_ns) / 1e3 for s in stamped if s.host_ns > 10**10])
     assert np.abs(late_us).max() < 70
