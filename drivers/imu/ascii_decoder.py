@@ -4,10 +4,9 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import reduce
-from operator import xor
 from types import MappingProxyType
 
+from drivers.framing import xor_of
 from drivers.samples import ImuSample, Vector
 
 MAX_LINE_BYTES = 512
@@ -29,8 +28,8 @@ AXES = {"accel": ("ax", "ay", "az"), "gyro": ("gx", "gy", "gz"), "mag": ("mx", "
 TIME, TEMPERATURE, IGNORED = "time", "temperature", "-"
 COLUMNS = frozenset((TIME, TEMPERATURE, IGNORED, *(axis for axes in AXES.values() for axis in axes)))
 
-_ANY_SEPARATOR = re.compile(r"[,;\t ]+")
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?")
+_TO_BLANKS = bytes.maketrans(b",;\t", b"   ")
+_NUMERIC = b"0123456789+-.eE \t"
 _CHECKSUM = re.compile(rb"\*([0-9A-Fa-f]{2})$")
 
 
@@ -71,6 +70,15 @@ class AsciiDecoder:
     _buffer: bytearray = field(default_factory=bytearray)
     _buffer_offset: int = 0
     _is_cut: bool = True
+    _picked: list[int] = field(init=False)
+    _places: dict[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Which columns are read, those of one sensor on end, and where each is among them."""
+        columns = self.line_format.columns
+        names = [name for name in (TIME, *AXES["accel"], *AXES["gyro"], *AXES["mag"], TEMPERATURE) if name in columns]
+        self._picked = [columns.index(name) for name in names]
+        self._places = {name: place for place, name in enumerate(names)}
 
     @property
     def waiting_bytes(self) -> int:
@@ -119,47 +127,49 @@ class AsciiDecoder:
         line_format = self.line_format
         if line_format.has_checksum:
             match = _CHECKSUM.search(line)
-            if match is None or reduce(xor, line[: match.start()].removeprefix(b"$"), 0) != int(match[1], 16):
+            if match is None or xor_of(line[: match.start()].removeprefix(b"$")) != int(match[1], 16):
                 return None
             line = line[: match.start()]
         prefix = line_format.prefix.encode()
-        if not line.isascii() or not line.startswith(prefix):
+        if not line.startswith(prefix):
             return None
-        text = line[len(prefix) :].decode("ascii").strip()
-        texts = text.split(line_format.separator) if line_format.separator else _ANY_SEPARATOR.split(text)
+        text = line[len(prefix) :].strip()
+        separator = line_format.separator.encode()
+        texts = text.split(separator) if separator else text.translate(_TO_BLANKS).split()
         if len(texts) != len(line_format.columns):
             return None
-        numbers: dict[str, float] = {}
-        ticks = None
-        for column, number in zip(line_format.columns, texts, strict=True):
-            if column == IGNORED:
-                continue
-            number = number.strip()
-            if _NUMBER.fullmatch(number) is None or not math.isfinite(value := float(number)):
-                return None
-            if column == TIME:
-                ticks = _ticks(number, line_format.time_factor)
-            numbers[column] = value
-        celsius_or_kelvin = numbers.get(TEMPERATURE)
+        picked = [texts[place] for place in self._picked]
+        if b"".join(picked).translate(None, _NUMERIC):  # Python also reads "nan" and "1_0"
+            return None
+        try:
+            numbers = list(map(float, picked))
+        except ValueError:
+            return None
+        if not math.isfinite(sum(numbers)):
+            return None
+        places = self._places
+        celsius_or_kelvin = numbers[places[TEMPERATURE]] if TEMPERATURE in places else None
         offset = ZERO_CELSIUS_K if line_format.celsius else 0.0
+        accel, gyro, mag = (
+            _vector(numbers, places.get(axes[0]), line_format.factors[kind]) for kind, axes in AXES.items()
+        )
         return ImuSample(
             None,
-            ticks,
-            _vector(numbers, "accel", line_format.factors),
-            _vector(numbers, "gyro", line_format.factors),
-            _vector(numbers, "mag", line_format.factors),
+            _ticks(picked[places[TIME]], line_format.time_factor) if TIME in places else None,
+            accel,
+            gyro,
+            mag,
             None if celsius_or_kelvin is None else celsius_or_kelvin + offset,
         )
 
 
-def _ticks(text: str, factor: int) -> int:
+def _ticks(text: bytes, factor: int) -> int:
     """Whole numbers exactly, however long; others to the nearest tick."""
-    return int(text) * factor if text.lstrip("+-").isdigit() else round(float(text) * factor)
+    return int(text) * factor if text.strip().lstrip(b"+-").isdigit() else round(float(text) * factor)
 
 
-def _vector(numbers: dict[str, float], kind: str, factors: Mapping[str, float]) -> Vector | None:
-    x, y, z = AXES[kind]
-    if x not in numbers:
+def _vector(numbers: list[float], place: int | None, factor: float) -> Vector | None:
+    if place is None:
         return None
-    factor = factors[kind]
-    return numbers[x] * factor, numbers[y] * factor, numbers[z] * factor
+    x, y, z = numbers[place : place + 3]
+    return x * factor, y * factor, z * factor

@@ -13,9 +13,8 @@ from drivers.imu.mip_decoder import (
     GYRO,
     MAG,
     MAX_PACKET_BYTES,
-    REFERENCE_TIME,
     SENSOR_SET,
-    TICKS,
+    TIME_FIELDS,
     MipDecoder,
     Packet,
     TimeSource,
@@ -32,7 +31,6 @@ IMU_BASE_RATE, IMU_FORMAT, BASE_RATE, FORMAT, STREAM = 0x06, 0x08, 0x0E, 0x0F, 0
 ACKNOWLEDGEMENT = 0xF1
 WRITE = 0x01
 LEGACY_IMU_STREAM = 0x01
-TIME_FIELDS: dict[TimeSource, int] = {"reference": REFERENCE_TIME, "gps": GPS_CORRELATION, "ticks": TICKS}
 PACKET_BYTES = 6 + 10 + 3 * 14
 ERROR_TEXTS = {1: "unknown command", 2: "invalid checksum", 3: "invalid parameter", 4: "command failed", 5: "timeout"}
 DEFAULT_BASE_RATE_HZ = 1000
@@ -176,7 +174,7 @@ def ask(
     def answer(came: Packet) -> bytes | None:
         if came[0] != descriptor_set:
             return None
-        found = list(fields(came[1]))
+        found = fields(came[1])
         for place, (field_kind, field_data) in enumerate(found):
             if field_kind == ACKNOWLEDGEMENT and field_data[:1] == bytes((kind,)):
                 if code := field_data[1] if len(field_data) > 1 else 1:

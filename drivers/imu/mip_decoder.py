@@ -7,11 +7,10 @@ Fletcher's over everything before it.
 import math
 import re
 import struct
+import zlib
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import accumulate
-from typing import Literal
+from typing import Any, Literal
 
 from drivers.framing import FramedDecoder, Framer, StepCounter
 from drivers.samples import ImuSample, Vector
@@ -20,21 +19,24 @@ SYNC = b"\x75\x65"
 OVERHEAD_BYTES = 6
 MAX_PACKET_BYTES = 255 + OVERHEAD_BYTES
 MAX_REPLIES = 64
+ADLER_BLOCK_BYTES = 22
 
 SENSOR_SET, FILTER_SET = 0x80, 0x82
 LAST_COMMAND_SET = 0x7F
 ACCEL, GYRO, MAG = 0x04, 0x05, 0x06
 TEMPERATURE, GPS_CORRELATION = 0x14, 0x12
 TICKS, GPS_TIME, REFERENCE_TIME = 0xD1, 0xD3, 0xD5
-FIELD_BYTES = {
-    ACCEL: 12,
-    GYRO: 12,
-    MAG: 12,
-    TEMPERATURE: 12,
-    GPS_CORRELATION: 12,
-    GPS_TIME: 12,
-    TICKS: 4,
-    REFERENCE_TIME: 8,
+_VECTOR = struct.Struct(">3f")
+_GPS = struct.Struct(">dHH")
+FIELDS = {
+    ACCEL: _VECTOR,
+    GYRO: _VECTOR,
+    MAG: _VECTOR,
+    TEMPERATURE: _VECTOR,
+    GPS_CORRELATION: _GPS,
+    GPS_TIME: _GPS,
+    TICKS: struct.Struct(">I"),
+    REFERENCE_TIME: struct.Struct(">Q"),
 }
 
 M_S2_PER_G = 9.80665
@@ -43,12 +45,11 @@ ZERO_CELSIUS_K = 273.15
 NS_PER_S = 1_000_000_000
 WEEK_S = 604_800
 
-_VECTOR = struct.Struct(">3f")
-_GPS = struct.Struct(">dHH")
 _START = re.compile(rb"\x75(?=\x65|\Z)")
 
 Packet = tuple[int, bytes]
 TimeSource = Literal["reference", "gps", "ticks"]
+TIME_FIELDS: dict[TimeSource, int] = {"reference": REFERENCE_TIME, "gps": GPS_CORRELATION, "ticks": TICKS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,24 +64,34 @@ class GpsTime:
     flags: int
 
 
-def fletcher(data: bytes | bytearray) -> bytes:
-    """The two bytes of the checksum."""
-    sums = list(accumulate(data))
-    return bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
+def fletcher(data: bytes) -> bytes:
+    """The two bytes of the checksum: the sum of all bytes, and the sum of the sums up to each.
+
+    Adler-32 has both in blocks so short that its modulus (65521) does not show, and is faster than a loop.
+    """
+    first = second = 0
+    for start in range(0, len(data), ADLER_BLOCK_BYTES):
+        block = data[start : start + ADLER_BLOCK_BYTES]
+        sums = zlib.adler32(block, 0)
+        second += first * len(block) + (sums >> 16)
+        first += sums & 0xFFFF
+    return bytes((first & 0xFF, second & 0xFF))
 
 
-def fields(payload: bytes) -> Iterator[tuple[int, bytes]]:
+def fields(payload: bytes) -> list[tuple[int, bytes]]:
     """The (kind, data) fields of a payload, up to where they stop making sense."""
-    position = 0
-    while position + 2 <= len(payload):
-        size = payload[position]
-        if size < 2 or position + size > len(payload):
-            return
-        yield payload[position + 1], payload[position + 2 : position + size]
-        position += size
+    found = []
+    position, last = 0, len(payload) - 2
+    while position <= last:
+        end = position + payload[position]
+        if end < position + 2 or end > last + 2:
+            break
+        found.append((payload[position + 1], payload[position + 2 : end]))
+        position = end
+    return found
 
 
-def _length(buffer: bytearray, position: int) -> int | None:
+def _length(buffer: bytes, position: int) -> int | None:
     available = len(buffer) - position
     if available < 4:
         return None
@@ -126,10 +137,14 @@ class MipDecoder(FramedDecoder):
         return samples
 
     def _sample(self, payload: bytes) -> ImuSample | None:
-        came = {kind: data for kind, data in fields(payload) if len(data) == FIELD_BYTES.get(kind)}
+        came: dict[int, tuple[Any, ...]] = {}
+        for kind, data in fields(payload):
+            layout = FIELDS.get(kind)
+            if layout is not None and layout.size == len(data):
+                came[kind] = layout.unpack(data)
         ticks = self._ticks(came)
         if GPS_TIME in came:
-            time_of_week_s, week, flags = _GPS.unpack(came[GPS_TIME])
+            time_of_week_s, week, flags = came[GPS_TIME]
             self.gps_time = (ticks, GpsTime(week, time_of_week_s, flags))
         accel, gyro = _vector(came.get(ACCEL), M_S2_PER_G), _vector(came.get(GYRO), 1.0)
         mag = _vector(came.get(MAG), UT_PER_GAUSS)
@@ -151,22 +166,23 @@ class MipDecoder(FramedDecoder):
             None if celsius is None else celsius[2] + ZERO_CELSIUS_K,
         )
 
-    def _ticks(self, came: dict[int, bytes]) -> int | None:
-        match self.time_source:
-            case "reference" if REFERENCE_TIME in came:
-                return int.from_bytes(came[REFERENCE_TIME])
-            case "ticks" if TICKS in came:
-                return int.from_bytes(came[TICKS])
-            case "gps" if GPS_CORRELATION in came:
-                time_of_week_s, week, _ = _GPS.unpack(came[GPS_CORRELATION])
-                if 0 <= time_of_week_s < WEEK_S:
-                    ticks: int = week * WEEK_S * NS_PER_S + round(time_of_week_s * NS_PER_S)
-                    return ticks
-        return None
+    def _ticks(self, came: dict[int, tuple[Any, ...]]) -> int | None:
+        found = came.get(TIME_FIELDS[self.time_source])
+        if found is None:
+            return None
+        ticks: int
+        if self.time_source != "gps":
+            (ticks,) = found
+            return ticks
+        time_of_week_s, week, _ = found
+        if not 0 <= time_of_week_s < WEEK_S:
+            return None
+        ticks = week * WEEK_S * NS_PER_S + round(time_of_week_s * NS_PER_S)
+        return ticks
 
 
-def _vector(data: bytes | None, factor: float) -> Vector | None:
-    if data is None:
+def _vector(numbers: tuple[Any, ...] | None, factor: float) -> Vector | None:
+    if numbers is None:
         return None
-    x, y, z = _VECTOR.unpack(data)
+    x, y, z = numbers
     return (x * factor, y * factor, z * factor) if math.isfinite(x + y + z) else None

@@ -8,14 +8,13 @@ choice and order that may differ from frame to frame.
 import math
 import re
 import struct
-import zlib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any
+from typing import TypeAlias
 
-from drivers.framing import FramedDecoder, Framer, SequenceCounter
+from drivers.framing import FramedDecoder, Framer, SequenceCounter, byte_sum
 from drivers.samples import ImuSample, Vector
 
 MTDATA2 = 0x36
@@ -46,7 +45,8 @@ _NUMBERS = {
 }
 _LAYOUTS = {PACKET_COUNTER: "H", SAMPLE_TIME_FINE: "I"}
 
-_Place = tuple[int, int]
+_Values: TypeAlias = tuple[float, ...]
+_Reader = Callable[[_Values], _Values]
 
 Message = tuple[int, bytes]
 """Message id and payload."""
@@ -62,7 +62,7 @@ def message(frame: bytes) -> Message:
     return frame[2], frame[6 if frame[3] == 0xFF else 4 : -1]
 
 
-def _length(buffer: bytearray, position: int) -> int | None:
+def _length(buffer: bytes, position: int) -> int | None:
     available = len(buffer) - position
     if available < 4:
         return None
@@ -77,7 +77,7 @@ def _length(buffer: bytearray, position: int) -> int | None:
     if available < length:
         return None
     end = position + length
-    if _sum(buffer[position + 1 : end]) & 0xFF:
+    if byte_sum(buffer[position + 1 : end]) & 0xFF:
         return 0
     # The checksum lets 1 of 256 false preambles pass; one that swallowed a measurement rarely has whole items.
     if buffer[position + 2] == MTDATA2 and not _items_fill(buffer, position + header, end - 1):
@@ -85,13 +85,9 @@ def _length(buffer: bytearray, position: int) -> int | None:
     return length
 
 
-def _sum(data: bytearray) -> int:
-    """The sum of all bytes. Adler-32 begins with it (plus one, modulo 65521), and is ten times as fast."""
-    return (zlib.adler32(data) & 0xFFFF) - 1 if len(data) < 256 else sum(data)
-
-
-def _items_fill(buffer: bytearray, position: int, end: int) -> bool:
-    while position + 3 <= end:
+def _items_fill(buffer: bytes, position: int, end: int) -> bool:
+    last = end - 3
+    while position <= last:
         position += 3 + buffer[position + 2]
     return position == end
 
@@ -160,14 +156,17 @@ def decode_mtdata2(
         values = shape.layout.unpack(payload)
         if shapes is not None:
             shapes[len(payload)] = shape
-    mag, celsius = _vector(values, shape.mag), _numbers(values, shape.temperature, 1)
+    accel, gyro, mag = _vector(values, shape.accel), _vector(values, shape.gyro), _vector(values, shape.mag)
+    if mag is not None:
+        mag = (mag[0] * magnetic_field_ut, mag[1] * magnetic_field_ut, mag[2] * magnetic_field_ut)
+    celsius = math.nan if shape.temperature is None else shape.temperature(values)[0]
     return ImuSample(
-        None if shape.counter is None else values[shape.counter[0]],
-        None if shape.ticks is None else values[shape.ticks[0]],
-        _vector(values, shape.accel),
-        _vector(values, shape.gyro),
-        mag and (mag[0] * magnetic_field_ut, mag[1] * magnetic_field_ut, mag[2] * magnetic_field_ut),
-        None if celsius is None else celsius[0] + ZERO_CELSIUS_K,
+        None if shape.counter is None else int(values[shape.counter]),
+        None if shape.ticks is None else int(values[shape.ticks]),
+        accel,
+        gyro,
+        mag,
+        celsius + ZERO_CELSIUS_K if math.isfinite(celsius) else None,
     )
 
 
@@ -186,7 +185,7 @@ class _Shape:
     """How items lie in a payload: nearly all measurements of a device have one of a few shapes.
 
     layout: headers and data of all items. headers: takes the former out of its values, which are then as `expected`.
-    The others: where the values of a quantity begin, and their number format; None where the payload has it not.
+    The others: where the value of a quantity is, or what reads its numbers; None where the payload has it not.
     """
 
     __slots__ = ("accel", "counter", "expected", "gyro", "headers", "layout", "mag", "temperature", "ticks")
@@ -196,12 +195,14 @@ class _Shape:
         count = 0
         header_places: list[int] = []
         expected: list[int] = []
-        places: dict[int, _Place] = {}
+        places: dict[int, int] = {}
+        readers: dict[int, _Reader] = {}
         for item_id, data in mtdata2_items(payload):
             kind, number_format = item_id & ITEM_MASK, item_id & 3
             data_layout = _LAYOUTS.get(kind) or _NUMBER_LAYOUTS[number_format] * _NUMBERS.get(kind, 0)
             if data_layout and struct.calcsize(">" + data_layout) == len(data):
-                places[kind] = (count + 2, number_format)
+                places[kind] = count + 2
+                readers[kind] = _reader(count + 2, number_format, _NUMBERS.get(kind, 0))
             else:
                 data_layout = f"{len(data)}s"
             layout += "HB" + data_layout
@@ -212,22 +213,23 @@ class _Shape:
         self.headers = itemgetter(*header_places) if header_places else lambda values: ()
         self.expected = tuple(expected)
         self.counter, self.ticks = places.get(PACKET_COUNTER), places.get(SAMPLE_TIME_FINE)
-        self.accel = places.get(ACCELERATION) or places.get(ACCELERATION_HR)
-        self.gyro = places.get(RATE_OF_TURN) or places.get(RATE_OF_TURN_HR)
-        self.mag, self.temperature = places.get(MAGNETIC_FIELD), places.get(TEMPERATURE)
+        self.accel = readers.get(ACCELERATION) or readers.get(ACCELERATION_HR)
+        self.gyro = readers.get(RATE_OF_TURN) or readers.get(RATE_OF_TURN_HR)
+        self.mag, self.temperature = readers.get(MAGNETIC_FIELD), readers.get(TEMPERATURE)
 
 
-def _vector(values: tuple[Any, ...], place: "_Place | None") -> Vector | None:
-    return _numbers(values, place, 3)  # type: ignore[return-value]
-
-
-def _numbers(values: tuple[Any, ...], place: "_Place | None", count: int) -> tuple[float, ...] | None:
-    if place is None:
+def _vector(values: _Values, reader: _Reader | None) -> Vector | None:
+    if reader is None:
         return None
-    first, number_format = place
+    x, y, z = numbers = reader(values)
+    return numbers if math.isfinite(x + y + z) else None  # type: ignore[return-value]
+
+
+def _reader(first: int, number_format: int, count: int) -> _Reader:
+    """What takes so many numbers of a format out of the values."""
     if number_format == 1:
-        return tuple(value / (1 << 20) for value in values[first : first + count])
+        return lambda values: tuple(value / (1 << 20) for value in values[first : first + count])
     if number_format == 2:  # the 32 bits of the fraction come before the 16 bits of the integer
-        return tuple(values[i + 1] + values[i] / (1 << 32) for i in range(first, first + 2 * count, 2))
-    numbers = values[first : first + count]
-    return numbers if all(map(math.isfinite, numbers)) else None
+        places = range(first, first + 2 * count, 2)
+        return lambda values: tuple(values[i + 1] + values[i] / (1 << 32) for i in places)
+    return itemgetter(slice(first, first + count))

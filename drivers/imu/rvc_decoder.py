@@ -7,7 +7,7 @@ import re
 import struct
 from dataclasses import dataclass, field
 
-from drivers.framing import FramedDecoder, Framer, SequenceCounter
+from drivers.framing import FramedDecoder, Framer, SequenceCounter, byte_sum
 from drivers.samples import ImuSample
 
 FRAME_BYTES = 19
@@ -18,11 +18,11 @@ _BODY = struct.Struct("<B6h3xB")
 _START = re.compile(rb"\xaa(?=\xaa|\Z)")
 
 
-def _length(buffer: bytearray, position: int) -> int | None:
+def _length(buffer: bytes, position: int) -> int | None:
     if len(buffer) - position < FRAME_BYTES:
         return None
     end = position + FRAME_BYTES
-    return FRAME_BYTES if sum(buffer[position + 2 : end - 1]) & 0xFF == buffer[end - 1] else 0
+    return FRAME_BYTES if byte_sum(buffer[position + 2 : end - 1]) & 0xFF == buffer[end - 1] else 0
 
 
 @dataclass(slots=True)

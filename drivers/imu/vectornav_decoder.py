@@ -11,10 +11,8 @@ import re
 import struct
 from collections import deque
 from dataclasses import dataclass, field
-from functools import reduce
-from operator import xor
 
-from drivers.framing import FramedDecoder, Framer, StepCounter
+from drivers.framing import FramedDecoder, Framer, StepCounter, xor_of
 from drivers.samples import ImuSample, Vector
 
 SYNC = 0xFA
@@ -58,7 +56,7 @@ _READ: dict[tuple[int, int], tuple[str, tuple[tuple[str, int], ...]]] = {
 _START = re.compile(rb"\xfa|\$(?=V|\Z)")
 _LINE = re.compile(rb"\$VN[\x20-\x23\x25-\x29\x2b-\x7e]*\*(?:[0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})(?=\r|\n)")
 _LINE_SO_FAR = re.compile(rb"\$(?:V(?:N[\x20-\x23\x25-\x29\x2b-\x7e]*(?:\*[0-9A-Fa-f]{0,4})?)?)?")
-_NUMBER = re.compile(r"[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?")
+_NUMERIC = b"0123456789+-.eE"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +107,7 @@ def _make_layout(header: bytes) -> _Layout | None:
     return _Layout(1 + len(header), 1 + len(header) + unpack.size + 2, unpack, places)
 
 
-def _length(buffer: bytearray, position: int) -> int | None:
+def _length(buffer: bytes, position: int) -> int | None:
     if buffer[position] == SYNC:
         return _binary_length(buffer, position)
     match = _LINE.match(buffer, position, position + MAX_LINE_BYTES)
@@ -120,7 +118,7 @@ def _length(buffer: bytearray, position: int) -> int | None:
     return match.end() - position if _line_is_good(buffer[position : match.end()]) else 0
 
 
-def _binary_length(buffer: bytearray, position: int) -> int | None:
+def _binary_length(buffer: bytes, position: int) -> int | None:
     available = len(buffer) - position
     if available < 2:
         return None
@@ -130,7 +128,7 @@ def _binary_length(buffer: bytearray, position: int) -> int | None:
     header_end = 2 + 2 * groups.bit_count()
     if available < header_end:
         return None
-    layout = _layout(bytes(buffer[position + 1 : position + header_end]))
+    layout = _layout(buffer[position + 1 : position + header_end])
     if layout is None:
         return 0
     if available < layout.frame_bytes:
@@ -138,10 +136,9 @@ def _binary_length(buffer: bytearray, position: int) -> int | None:
     return 0 if binascii.crc_hqx(buffer[position + 1 : position + layout.frame_bytes], 0) else layout.frame_bytes
 
 
-def _line_is_good(line: bytes | bytearray) -> bool:
-    body, _, checksum = bytes(line[1:]).rpartition(b"*")
-    expected = binascii.crc_hqx(body, 0) if len(checksum) == 4 else reduce(xor, body, 0)
-    return int(checksum, 16) == expected
+def _line_is_good(line: bytes) -> bool:
+    body, _, checksum = line[1:].partition(b"*")
+    return int(checksum, 16) == (binascii.crc_hqx(body, 0) if len(checksum) == 4 else xor_of(body))
 
 
 @dataclass(slots=True)
@@ -168,7 +165,7 @@ class VectornavDecoder(FramedDecoder):
         self.starts = []
         for start, frame in self.framer.feed(data):
             self.frames += 1
-            sample = self._binary(frame) if frame[0] == SYNC else self._line(frame.decode("ascii"))
+            sample = self._binary(frame) if frame[0] == SYNC else self._line(frame)
             if sample is not None:
                 samples.append(sample)
                 self.starts.append(start)
@@ -194,15 +191,15 @@ class VectornavDecoder(FramedDecoder):
             None, ticks, accel, gyro, _microtesla(gauss), celsius + ZERO_CELSIUS_K if math.isfinite(celsius) else None
         )
 
-    def _line(self, line: str) -> ImuSample | None:
-        fields = line[1 : line.rindex("*")].split(",")
+    def _line(self, line: bytes) -> ImuSample | None:
+        fields = line[1 : line.index(b"*")].split(b",")
         match fields[0]:
-            case "VNIMU" if len(fields) >= 12:
+            case b"VNIMU" if len(fields) >= 12:
                 numbers = _numbers(fields[1:11])
-            case "VNYMR" if len(fields) >= 13:
+            case b"VNYMR" if len(fields) >= 13:
                 numbers = _numbers(fields[4:13])
             case _:
-                self.replies.append(line)
+                self.replies.append(line.decode("ascii"))
                 return None
         if numbers is None:
             return None
@@ -229,8 +226,11 @@ def _microtesla(gauss: Vector | None) -> Vector | None:
     return gauss and (gauss[0] * UT_PER_GAUSS, gauss[1] * UT_PER_GAUSS, gauss[2] * UT_PER_GAUSS)
 
 
-def _numbers(fields: list[str]) -> list[float] | None:
-    if not all(map(_NUMBER.fullmatch, fields)):
+def _numbers(fields: list[bytes]) -> list[float] | None:
+    if b"".join(fields).translate(None, _NUMERIC):  # Python also reads "nan" and "1_0"
         return None
-    numbers = list(map(float, fields))
-    return numbers if all(map(math.isfinite, numbers)) else None
+    try:
+        numbers = list(map(float, fields))
+    except ValueError:
+        return None
+    return numbers if math.isfinite(sum(numbers)) else None

@@ -9,8 +9,9 @@ import re
 import struct
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
 
-from drivers.framing import FramedDecoder, Framer
+from drivers.framing import FramedDecoder, Framer, byte_sum
 from drivers.samples import ImuSample, Vector
 
 FRAME_BYTES = 11
@@ -20,17 +21,19 @@ ACCEL_RANGE_G, GYRO_RANGE_DEG_S = 16.0, 2000.0
 FULL_SCALE = 32768
 VENDOR_G_M_S2 = 9.8
 ZERO_CELSIUS_K = 273.15
+_G_PER_STEP = ACCEL_RANGE_G / FULL_SCALE
+_RAD_S_PER_STEP = math.radians(GYRO_RANGE_DEG_S / FULL_SCALE)
 
-_FOUR = struct.Struct("<4h")
-_TIME = struct.Struct("<6BH")
+_FOUR = struct.Struct("<2x4hx")
+_TIME = struct.Struct("<2x6BHx")
 _START = re.compile(rb"\x55(?=[\x50-\x5a]|\Z)")
 _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 
 
-def _length(buffer: bytearray, position: int) -> int | None:
+def _length(buffer: bytes, position: int) -> int | None:
     if len(buffer) - position < FRAME_BYTES:
         return None
-    return FRAME_BYTES if sum(buffer[position : position + 10]) & 0xFF == buffer[position + 10] else 0
+    return FRAME_BYTES if byte_sum(buffer[position : position + 10]) & 0xFF == buffer[position + 10] else 0
 
 
 @dataclass(slots=True)
@@ -59,7 +62,7 @@ class WitmotionDecoder(FramedDecoder):
         self.starts = []
         for start, frame in self.framer.feed(data):
             self.frames += 1
-            self._take(start, frame[1], frame[2:10], samples)
+            self._take(start, frame[1], frame, samples)
         return samples
 
     def flush(self) -> list[ImuSample]:
@@ -69,7 +72,7 @@ class WitmotionDecoder(FramedDecoder):
         self._close(samples)
         return samples
 
-    def _take(self, start: int, frame_id: int, data: bytes, samples: list[ImuSample]) -> None:
+    def _take(self, start: int, frame_id: int, frame: bytes, samples: list[ImuSample]) -> None:
         if frame_id <= self._last_id:
             self._close(samples)
             self._ender = self._last_id if self._last_id == self._previous_end else 0
@@ -78,7 +81,7 @@ class WitmotionDecoder(FramedDecoder):
         elif not self._group:
             self._start = start
         self._last_id = frame_id
-        self._group[frame_id] = data
+        self._group[frame_id] = frame
         if frame_id == self._ender:
             self._close(samples)
 
@@ -96,31 +99,35 @@ class WitmotionDecoder(FramedDecoder):
         if ACCEL not in group and GYRO not in group:
             return None
         celsius = _FOUR.unpack(group[ACCEL])[3] / 100 if ACCEL in group else None
-        to_m_s2 = ACCEL_RANGE_G / FULL_SCALE * self.gravity_m_s2
-        to_rad_s = math.radians(GYRO_RANGE_DEG_S / FULL_SCALE)
         return ImuSample(
             None,
             _calendar_ms(group.get(TIME)),
-            _vector(group.get(ACCEL), to_m_s2),
-            _vector(group.get(GYRO), to_rad_s),
+            _vector(group.get(ACCEL), _G_PER_STEP * self.gravity_m_s2),
+            _vector(group.get(GYRO), _RAD_S_PER_STEP),
             None if self.magnetometer_ut is None else _vector(group.get(MAG), self.magnetometer_ut),
             None if celsius is None else celsius + ZERO_CELSIUS_K,
         )
 
 
-def _vector(data: bytes | None, factor: float) -> Vector | None:
-    if data is None:
+def _vector(frame: bytes | None, factor: float) -> Vector | None:
+    if frame is None:
         return None
-    x, y, z, _ = _FOUR.unpack(data)
+    x, y, z, _ = _FOUR.unpack(frame)
     return x * factor, y * factor, z * factor
 
 
-def _calendar_ms(data: bytes | None) -> int | None:
-    if data is None:
+def _calendar_ms(frame: bytes | None) -> int | None:
+    if frame is None:
         return None
-    year, month, day, hour, minute, second, millisecond = _TIME.unpack(data)
+    year, month, day, hour, minute, second, millisecond = _TIME.unpack(frame)
+    minute_ms = _minute_ms(year, month, day, hour, minute)
+    return None if minute_ms is None or second > 59 else minute_ms + second * 1000 + int(millisecond)
+
+
+@lru_cache(maxsize=4)
+def _minute_ms(year: int, month: int, day: int, hour: int, minute: int) -> int | None:
     try:
-        moment = datetime(2000 + year, month, day, hour, minute, second, tzinfo=UTC)
+        moment = datetime(2000 + year, month, day, hour, minute, tzinfo=UTC)
     except ValueError:
         return None
-    return int((moment - _EPOCH).total_seconds()) * 1000 + int(millisecond)
+    return int((moment - _EPOCH).total_seconds()) * 1000
