@@ -3,9 +3,8 @@
     capture ──▶ CaptureLinks ──▶ driver ──▶ Pipeline ──▶ recording
 
 Time 0 is LEAD_NS before the first arrival, so that nothing sampled before it came is lost; for a tape in the raw/ of a
-recording it is the time 0 of that take, whose settings of the device hold too (unless they are set otherwise). So the
-tape gives the same samples as the take. Their times go through the clock map again and may differ by what the map
-learnt a moment earlier or later.
+recording it is the time 0 of that take, whose settings of the device hold too. Unless some are set otherwise, samples
+get the times that they have in the take, so the tape gives the same lines and the same files.
 
 Plain bytes have no arrival times: a sample arrives when the device's own clock says, or where it has none, when the
 line's baud rate would have brought it. recording.json says which.
@@ -28,10 +27,11 @@ from drivers.samples import ClockPairs, DeviceEvent, FixSample, Received, Sample
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.pipeline import DeviceInTake, Pipeline, count_event
 from recorder.recording.folder import free_bytes, low_water_bytes
-from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, StreamSummary, read_manifest
+from recorder.recording.manifest import NS_PER_S, DeviceSummary, Manifest, Resync, StreamSummary, read_manifest
 from recorder.recording.raw import FOLDER as RAW_FOLDER
 from recorder.recording.writer import RecordingWriter, new_manifest
 from recorder.rig import RigDevice, apply_settings, parse_rig
+from recorder.take_stamps import TakeStamps
 
 LEAD_NS = 200_000_000
 ADVANCE_NS = 20_000_000
@@ -62,10 +62,16 @@ class Decoded:
 
 @dataclass(frozen=True, slots=True)
 class _Tape:
-    """The take that a raw tape belongs to: the device's settings, and UTC of its time 0."""
+    """The take that a raw tape belongs to.
 
+    settings: of the device. start_ns: UTC of time 0. resync: how it was refined. keeps_times: decoded as it was taken.
+    """
+
+    folder: Path
     settings: dict[str, Any]
     start_ns: int
+    resync: Resync | None
+    keeps_times: bool
 
 
 def decode(
@@ -82,7 +88,7 @@ def decode(
 
     Raises RecorderError: a file that is no capture, a driver or setting that does not fit, nothing found in it.
     """
-    tape = _tape(path, driver)
+    tape = _tape(path, driver, settings)
     device = _device(path, driver, settings, tape)
     try:
         capture = open_capture(path, int(getattr(device.config, "baud", DEFAULT_BAUD)))
@@ -105,18 +111,21 @@ def _check_empty(out: Path) -> None:
         raise StorageError(f"{out}: cannot write there: {error.strerror or error}") from error
 
 
-def _tape(path: Path, driver: str) -> _Tape | None:
+def _tape(path: Path, driver: str, settings: tuple[str, ...]) -> _Tape | None:
     """The take of a raw tape that still stands in its recording."""
+    folder = path.resolve().parent.parent
     if path.resolve().parent.name != RAW_FOLDER:
         return None
     try:
-        manifest = read_manifest(path.resolve().parent.parent)
+        manifest = read_manifest(folder)
     except (OSError, msgspec.DecodeError):
         return None
     entry = manifest.rig.get("devices", {}).get(path.stem)
     if not isinstance(entry, dict) or entry.get("driver") != driver:
         return None
-    return _Tape(entry, manifest.utc_at_time_0.by_host_ns)
+    is_refined = manifest.resync is not None and manifest.resync.state == "done"
+    resync = manifest.resync if is_refined else None
+    return _Tape(folder, entry, manifest.utc_at_time_0.by_host_ns, resync, keeps_times=not settings)
 
 
 def _device(path: Path, driver: str, settings: tuple[str, ...], tape: _Tape | None) -> RigDevice:
@@ -173,6 +182,7 @@ class _Decoding:
         self._now_ns = self._last_ns = self._advanced_ns = self._disk_ns = 0
         self._writer: RecordingWriter | None = None
         self._pipeline: Pipeline | None = None
+        self._stamps: TakeStamps | None = None
 
     def run(self, stop: threading.Event, on_progress: OnProgress) -> Decoded:
         """Read the capture to its end."""
@@ -279,9 +289,20 @@ class _Decoding:
             camera=None,
             summary=self._summary,
         )
-        self._pipeline = Pipeline(self._writer, [in_take], start_ns, NS_PER_S)
+        self._stamps = self._take_stamps()
+        restored = self._stamps.restored if self._stamps else None
+        self._pipeline = Pipeline(self._writer, [in_take], start_ns, NS_PER_S, restored=restored)
         for event in self._early_events:
             self._writer.events.write(device.name, event.kind, event.text, event.count)
+
+    def _take_stamps(self) -> TakeStamps | None:
+        """The stamps of the take that the tape is of; None where others are to be made."""
+        if self._tape is None or not self._tape.keeps_times:
+            return None
+        try:
+            return TakeStamps(self._tape.folder, self._device.name, self._driver.tick_hz, self._tape.start_ns)
+        except OSError:
+            return None
 
     def _utc_source(self) -> str:
         name = self._links.capture.path.name
@@ -330,6 +351,8 @@ class _Decoding:
         faults = self._writer.close(self._last_ns - manifest.start_monotonic_ns, stopped_by)
         if faults:
             raise StorageError(f"{self._out}: could not be finished: {'; '.join(faults)}")
+        if self._stamps is not None and self._tape is not None and self._tape.resync is not None:
+            return self._stamps.refine(self._out, manifest, self._tape.resync)
         return manifest
 
     def _nothing(self, fault: str) -> str:

@@ -6,6 +6,7 @@
 `take` is called with every sample in order of arrival, `advance` every few milliseconds, `finish` once.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -71,10 +72,8 @@ class _ClockTable:
         """What is to be kept of a sample that is no picture."""
         sample = stamped.sample
         if isinstance(sample, ScanSample):
-            if stamped.point_host_ns is not None and stamped.point_ticks is not None:
-                rows = scan_rows(stamped.point_ticks, stamped.point_host_ns, time_ns + start_ns)
-                rows[:, 2] -= start_ns
-                self.batches.append(rows)
+            if stamped.scan_knots is not None:
+                self.batches.append(scan_rows(stamped.scan_knots - np.array([0, start_ns]), time_ns))
         elif not isinstance(sample, ClockPairs) and sample.device_ticks is not None:
             self.rows.append((sample.device_ticks, stamped.arrival_ns, time_ns))
 
@@ -98,10 +97,15 @@ class Pipeline:
         pair_within_ns: int,
         *,
         inline_refit: bool = True,
+        restored: Callable[[Stamped], Stamped] | None = None,
     ) -> None:
-        """start_ns: host time of recording time 0. inline_refit: False when another thread calls `refit` often."""
+        """start_ns: host time of recording time 0. inline_refit: False when another thread calls `refit` often.
+
+        restored: gives samples other stamps than the clock maps do.
+        """
         self._writer = writer
         self._start_ns = start_ns
+        self._restored = restored
         self._devices = {device.name: device for device in devices}
         self._timebase = Timebase(start_ns, inline_refit=inline_refit)
         for device in devices:
@@ -179,6 +183,8 @@ class Pipeline:
                 return
 
     def _place(self, stamped: Stamped) -> None:
+        if self._restored is not None:
+            stamped = self._restored(stamped)
         device = self._devices[stamped.device]
         device.last_host_ns = stamped.host_ns
         time_ns = stamped.host_ns - self._start_ns

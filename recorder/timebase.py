@@ -17,6 +17,7 @@ from drivers.samples import ClockPairs, Sample, ScanSample, TwoWayPair
 from recorder.clock import ClockMap, ClockStream
 from recorder.clock_fit import Level
 from recorder.clock_grid import GridTracker
+from recorder.scan_times import Ints, PointTicks
 
 HOLD_AT_START_NS = 1_000_000_000
 HOLD_NS = 400_000_000
@@ -28,7 +29,8 @@ class Stamped:
     """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock.
 
     arrival_ns: when it came, its device's latency not taken off.
-    point_host_ns, point_ticks: host and device times of a scan's points, (n,) int64; the scan's time is the greatest.
+    point_host_ns: host times of a scan's points, (n,) int64; the scan's time is the greatest.
+    scan_knots: ticks and host times of the instants between which they are interpolated (recorder.scan_times).
     """
 
     device: str
@@ -36,8 +38,8 @@ class Stamped:
     device_ns: int
     arrival_ns: int
     sample: Sample
-    point_host_ns: npt.NDArray[np.int64] | None = None
-    point_ticks: npt.NDArray[np.int64] | None = None
+    point_host_ns: Ints | None = None
+    scan_knots: Ints | None = None
 
 
 @dataclass(slots=True)
@@ -201,25 +203,20 @@ class Timebase:
         return self.release(max((clock.hold_until_ns for clock in self._clocks.values()), default=0))
 
     def _stamp(self, host_ns: int, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
-        point_host_ns = ticks = None
+        point_host_ns = knots = None
         if isinstance(sample, ScanSample) and len(sample.points):
-            point_host_ns, ticks = _point_times(entry, sample.points["timestamp"], arrival_ns)
+            point_host_ns, knots = _scan_times(entry, sample.points["timestamp"], arrival_ns)
             host_ns = int(point_host_ns.max())
         host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
         entry.last_host_ns = host_ns
-        return Stamped(entry.device, host_ns, device_ns, arrival_ns + entry.latency_ns, sample, point_host_ns, ticks)
+        return Stamped(entry.device, host_ns, device_ns, arrival_ns + entry.latency_ns, sample, point_host_ns, knots)
 
 
-def _point_times(
-    entry: _DeviceStream, timestamp_s: npt.NDArray[np.float64], arrival_ns: int
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Host times and ticks of a scan's points; worked out once for points on end that share their time."""
-    device_s = np.ascontiguousarray(timestamp_s)
-    is_new = np.ones(len(device_s), np.bool_)
-    np.not_equal(device_s[1:], device_s[:-1], out=is_new[1:])
-    first = np.flatnonzero(is_new)
-    counts = np.diff(first, append=len(device_s))
-    ticks = np.rint(device_s[first] * entry.tick_hz).astype(np.int64)
+def _scan_times(entry: _DeviceStream, timestamp_s: npt.NDArray[np.float64], arrival_ns: int) -> tuple[Ints, Ints]:
+    """Host times of a scan's points, (n,), and its knots: ticks and host times, (KNOTS, 2)."""
+    points = PointTicks.of(timestamp_s, entry.tick_hz)
+    ticks = points.knots()
     host_ns = entry.stream.host_ns(entry.stream.unwrap(ticks))
     host_ns -= max(int(host_ns.max()) - arrival_ns, 0)  # all of them: else those that are late would share a time
-    return host_ns.repeat(counts), ticks.repeat(counts)
+    knots = np.column_stack((ticks, host_ns))
+    return points.times_ns(knots), knots

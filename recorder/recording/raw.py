@@ -11,8 +11,9 @@ that was given online, in ns of recording time: the line's `time` is exactly sta
 its ticks and stamped anew.
 
 - A message that is no line of its own (a lidar packet) has NONE as stamp.
-- A lidar scan has SCAN_ROWS rows on end, with NONE as arrival (nothing is to be learnt from them): the ticks and stamps
-  of points spread over the scan, ascending, then the last point's ticks with the stamp of the line.
+- A lidar scan has SCAN_ROWS rows on end, with NONE as arrival (nothing is to be learnt from them): ticks and stamps of
+  instants spread evenly over the scan, between which the times of its points are interpolated (recorder.scan_times),
+  then the last point's ticks with the stamp of the line.
 - The pictures of a frame set have the stamp of their line, a lost one too.
 - Samples without device time have no row.
 
@@ -32,6 +33,7 @@ import numpy.typing as npt
 from drivers.samples import Chunk, Datagrams
 from recorder.recording.manifest import FileEntry
 from recorder.recording.work import ByteQueue, HashedFile, start_thread
+from recorder.scan_times import KNOTS
 
 FOLDER = "raw"
 QUEUE_BYTES = 64 << 20
@@ -39,7 +41,7 @@ FLUSH_S = 0.5
 SYNC_S = 1.0
 COLLECT_S = 0.1
 NONE = -(1 << 63)
-SCAN_ROWS = 64
+SCAN_ROWS = KNOTS + 1
 LINKTYPE_RAW_IP = 101
 LINKTYPE_USER0 = 147
 MAX_SERIAL_PACKET = 65535
@@ -136,13 +138,11 @@ def _packed_address(address: str) -> bytes:
     return bytes(int(part) for part in address.split("."))
 
 
-def scan_rows(point_ticks: Ints, point_time_ns: Ints, line_time_ns: int) -> Ints:
-    """(SCAN_ROWS, 3): what the clock table keeps of a scan."""
-    chosen = np.linspace(0, len(point_ticks) - 1, SCAN_ROWS - 1).astype(np.int64)
-    chosen = chosen[np.argsort(point_time_ns[chosen], kind="stable")]
+def scan_rows(knots: Ints, line_time_ns: int) -> Ints:
+    """(SCAN_ROWS, 3): what the clock table keeps of a scan. knots: (KNOTS, 2) ticks and recording time."""
     rows = np.full((SCAN_ROWS, 3), NONE, np.int64)
-    rows[:-1, 0], rows[:-1, 2] = point_ticks[chosen], point_time_ns[chosen]
-    rows[-1, 0], rows[-1, 2] = point_ticks[int(point_time_ns.argmax())], line_time_ns
+    rows[:-1, 0], rows[:-1, 2] = knots.T
+    rows[-1, 0], rows[-1, 2] = knots[-1, 0], line_time_ns
     return rows
 
 

@@ -10,7 +10,6 @@ import av
 import numpy as np
 import pytest
 
-from drivers.samples import POINT_DTYPE
 from recorder.decode import decode
 from recorder.recording.raw import NONE, read_clock_table
 from simulated_devices.scene import CameraRenderer, Room, stereo_pair
@@ -62,38 +61,28 @@ def test_every_device_is_in_it_and_nothing_was_lost(take: Path) -> None:
 
 
 TAPES = {"imu": "xsens", "gnss": "nmea", "lidar": "robosense", "mocap": "pose"}
-SAME_TIME_S = 500e-6
-GNSS_HOLD_S, GNSS_HELD_S = 1.2, 30e-3  # fixes of the first second are stamped by a dozen delays of 16 ms jitter
 
 
 @pytest.mark.parametrize("device", TAPES)
-def test_tapes_decode_to_the_same_samples(take: Path, tmp_path: Path, device: str) -> None:
-    """Values, points and counts are equal; times come out of the clock map again, about as before.
-
-    They differ where the map was asked a moment earlier or later, and for a clock that devices share in the take.
-    """
+def test_tapes_decode_to_the_same_lines_and_files(take: Path, tmp_path: Path, device: str) -> None:
+    """Times to the last bit, those given online and the refined ones."""
     out = tmp_path / "again"
     decode(
         take / "raw" / f"{device}.pcapng", TAPES[device], (), out, stop=Event(),
         on_progress=lambda _: None, on_event=lambda _, event: None,
     )  # fmt: skip
-    lines = [json.loads(line) for line in (take / "raw" / "data.online.jsonl").read_text().splitlines()]
-    again = [json.loads(line) for line in (out / "data.jsonl").read_text().splitlines()]
-    kinds = {_kind(line) for line in again}
-    for kind in kinds:
-        first = [line for line in lines if _kind(line) == kind]
-        second = [line for line in again if _kind(line) == kind]
-        if kind == "gps" and len(second) == len(first) + 1:  # the end of a file ends the epoch that a take breaks off
-            del second[-1]
-        assert list(map(_values, first)) == list(map(_values, second))
-        times_s = np.array([[one["time"], two["time"]] for one, two in zip(first, second, strict=True)])
-        apart_s = np.abs(times_s[:, 0] - times_s[:, 1])
-        limit_s = np.where((device == "gnss") & (times_s[:, 0] < GNSS_HOLD_S), GNSS_HELD_S, SAME_TIME_S)
-        assert (apart_s < limit_s).all()
+    for name in ("data.jsonl", "raw/data.online.jsonl"):
+        lines = [json.loads(line) for line in (take / name).read_text().splitlines()]
+        again = [json.loads(line) for line in (out / name).read_text().splitlines()]
+        kinds = {_kind(line) for line in again}
+        for kind in kinds:
+            first = [line for line in lines if _kind(line) == kind]
+            second = [line for line in again if _kind(line) == kind]
+            if kind == "gps" and len(second) == len(first) + 1:  # a file's end ends the epoch that a take breaks off
+                del second[-1]
+            assert list(map(_values, first)) == list(map(_values, second))
     for path in (out / "lidar").glob("*.bin"):
-        one, two = (np.fromfile(folder / "lidar" / path.name, POINT_DTYPE) for folder in (take, out))
-        for name in ("x", "y", "z", "intensity", "ring"):
-            assert np.array_equal(one[name], two[name])
+        assert path.read_bytes() == (take / "lidar" / path.name).read_bytes()
     manifest = json.loads((take / "recording.json").read_text())
     utc_minus_monotonic_ns = manifest["utc_at_time_0"]["host_clock_ns"] - manifest["start_monotonic_ns"]
     tables = [read_clock_table(folder / "raw" / f"{device}.clock") for folder in (take, out)]
@@ -107,8 +96,8 @@ def test_tapes_decode_to_the_same_samples(take: Path, tmp_path: Path, device: st
 def _values(line: dict) -> dict:
     """What does not depend on when a thread was woken: a pause within an epoch may end it before its accuracy came."""
     if "gps" in line:
-        return {key: line["gps"][key] for key in ("latitude", "longitude", "altitude")}
-    return {**line, "time": 0}
+        return {"time": line["time"]} | {key: line["gps"][key] for key in ("latitude", "longitude", "altitude")}
+    return line
 
 
 def _kind(line: dict) -> str:
