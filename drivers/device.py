@@ -6,7 +6,7 @@ entry point group `rigtape.drivers`, so any installed package can add one.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from threading import Event
 from typing import Any, Literal, Protocol
@@ -149,7 +149,7 @@ def _announced(driver: Driver, stop: Event) -> Iterator[Received]:
         if not is_announced and (item.chunks or item.samples):
             is_announced = True
             event = DeviceEvent("connected", _identity_text(driver))
-            yield replace(item, events=(event, *item.events))
+            yield msgspec.structs.replace(item, events=(event, *item.events))
         else:
             yield item
     if not stop.is_set():

@@ -164,8 +164,7 @@ class TwoWayPair:
 Sample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample | ClockPairs | TwoWayPair
 
 
-@dataclass(frozen=True, slots=True)
-class Chunk:
+class Chunk(Struct, frozen=True):
     """Bytes as they came from (or went to) the wire, for the raw tape.
 
     source, destination: (address, port) of a datagram, None on a serial line. sent: written by us.
@@ -217,8 +216,7 @@ class DeviceEvent:
     count: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(Struct, frozen=True):
     """What one read of a link brought: raw chunks, and the samples that became complete with their arrival.
 
     Arrival times are nanoseconds of the host's monotonic clock.

@@ -8,7 +8,7 @@ SerialDriver.connect    open the link, configure the device (Dialogue), which th
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from threading import Event
 from typing import Annotated, Generic, Protocol, TypeVar
@@ -152,7 +152,7 @@ class Arrivals:
         return arrival_ns - round((end - 1 - offset) * self.byte_time_ns)
 
 
-Watch = Callable[[int], Iterable[DeviceEvent]]
+Watch = Callable[[int], tuple[DeviceEvent, ...]]
 
 
 @dataclass(slots=True)
@@ -186,26 +186,27 @@ class Care:
             self._heard_ns = arrival_ns
         elif arrival_ns - self._heard_ns > self.silence_s * 1e9:
             raise DeviceError(f"{self.where}: no data for {self.silence_s:g} s")
-        told = list(self._no_frames(arrival_ns, data))
-        for watch in self.watches:
-            told += watch(arrival_ns)
-        return (*told, *self._bad_input(arrival_ns))
-
-    def _no_frames(self, arrival_ns: int, data: bytes) -> Iterator[DeviceEvent]:
         frames = self.frames()
+        told: tuple[DeviceEvent, ...] = ()
         if frames != self._frames:
             self._frames, self._framed_ns, self._warned = frames, arrival_ns, False
             self._unknown = b""
-            return
-        if self._warned:
-            return
+        elif not self._warned:
+            told = self._no_frames(arrival_ns, data)
+        for watch in self.watches:
+            if events := watch(arrival_ns):
+                told += events
+        return told + self._bad_input(arrival_ns)
+
+    def _no_frames(self, arrival_ns: int, data: bytes) -> tuple[DeviceEvent, ...]:
         self._unknown = (self._unknown + data)[-RECOGNISE_BYTES:]
-        if arrival_ns - self._framed_ns > self.silence_s * 1e9:
-            self._warned = True
-            looks_like = describe(self._unknown) or ("; is the baud rate right?" if self.is_serial else "")
-            text = f"{self.where}: bytes come, but no {self.message} for {self.silence_s:g} s{looks_like}"
-            self._unknown = b""
-            yield DeviceEvent("warning", text)
+        if arrival_ns - self._framed_ns <= self.silence_s * 1e9:
+            return ()
+        self._warned = True
+        looks_like = describe(self._unknown) or ("; is the baud rate right?" if self.is_serial else "")
+        text = f"{self.where}: bytes come, but no {self.message} for {self.silence_s:g} s{looks_like}"
+        self._unknown = b""
+        return (DeviceEvent("warning", text),)
 
     def _bad_input(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
         if self._garbage is None:
@@ -226,36 +227,42 @@ class GapWatch:
     lost_by: str
     _lost: int = 0
 
-    def __call__(self, arrival_ns: int) -> Iterator[DeviceEvent]:
+    def __call__(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
         """The messages lost since the last time."""
         lost = self.decoder.lost_messages - self._lost
-        if lost:
-            self._lost += lost
-            yield DeviceEvent("gap", f"{lost} messages lost, by {self.lost_by}", lost)
+        if not lost:
+            return ()
+        self._lost += lost
+        return (DeviceEvent("gap", f"{lost} messages lost, by {self.lost_by}", lost),)
 
 
 @dataclass(slots=True)
 class RateWatch:
-    """Tells once when samples come at another rate than expected. samples: how many came, counted by the user."""
+    """Tells once when samples come at another rate than expected. is_over: it has made up its mind."""
 
     rate_hz: float
     where: str
-    samples: int = 0
+    is_over: bool = False
+    _samples: int = 0
     _begin_ns: int | None = None
-    _told: bool = False
 
-    def __call__(self, arrival_ns: int) -> Iterator[DeviceEvent]:
+    def note(self, samples: list[tuple[int, Sample]]) -> None:
+        """Take in what one read brought."""
+        self._samples += sum(isinstance(sample, ImuSample) and sample.accel_m_s2 is not None for _, sample in samples)
+
+    def __call__(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
         """The warning, once a few seconds have passed."""
-        if self._told or not self.samples:
-            return
+        if self.is_over or not self._samples:
+            return ()
         if self._begin_ns is None:
-            self._begin_ns, self.samples = arrival_ns, 0
+            self._begin_ns, self._samples = arrival_ns, 0
         elif (elapsed_ns := arrival_ns - self._begin_ns) >= RATE_AFTER_NS:
-            self._told = True
-            measured_hz = self.samples * 1e9 / elapsed_ns
+            self.is_over = True
+            measured_hz = self._samples * 1e9 / elapsed_ns
             if abs(measured_hz - self.rate_hz) > RATE_TOLERANCE * self.rate_hz:
                 text = f"{self.where}: {measured_hz:.1f} samples a second come, and {self.rate_hz:g} were expected"
-                yield DeviceEvent("warning", text)
+                return (DeviceEvent("warning", text),)
+        return ()
 
 
 def check_bandwidth(
@@ -372,7 +379,8 @@ class SerialDriver(ABC, Generic[Decoder]):
         """The samples that one read completes, each with the arrival of its first byte."""
         if data:
             self._arrivals.note(arrival_ns, len(data))
-        return self._with_arrivals(self._decoder.feed(data))
+        samples = self._decoder.feed(data)
+        return self._with_arrivals(samples) if samples else []
 
     def _with_arrivals(self, samples: list[ImuSample]) -> list[tuple[int, Sample]]:
         starts = self._decoder.starts
@@ -402,16 +410,14 @@ class SerialDriver(ABC, Generic[Decoder]):
         chunks = self._begin(link)
         yield Received(chunks, tuple(self._early))
         decoder, rate = self._decoder, RateWatch(self._rate_hz, self.where)
-        watches: list[Watch] = [GapWatch(decoder, self.lost_by), *self._watches()]
-        if self.links is LIVE:  # a capture may be played at any rate
-            watches.append(rate)
+        rate.is_over = self.links is not LIVE  # a capture may be played at any rate
+        watches: tuple[Watch, ...] = (GapWatch(decoder, self.lost_by), rate, *self._watches())
         care = Care(decoder, lambda: decoder.frames, self.message, self.where, self.cut_bytes, watches=watches)
         while not stop.is_set():
             arrival_ns, data = link.read(READ_S)
             samples = self._stamped(arrival_ns, data)
-            rate.samples += sum(
-                isinstance(sample, ImuSample) and sample.accel_m_s2 is not None for _, sample in samples
-            )
+            if not rate.is_over:
+                rate.note(samples)
             events = care.events(arrival_ns, data)
             if data or events:
                 chunks = (Chunk(arrival_ns, data),) if data else ()

@@ -9,6 +9,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from msgspec import Struct
+
 T = TypeVar("T")
 P = TypeVar("P")
 REMEMBERED_SETS = 256
@@ -28,8 +30,7 @@ class FrameSet(Generic[P]):
     group: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Released(Generic[T, P]):
+class Released(Struct, Generic[T, P], frozen=True):
     """One item in its turn. late: items of a later time were given out before."""
 
     time_ns: int

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from drivers.samples import ClockPairs, Sample, ScanSample, TwoWayPair
 from recorder.clock import ClockMap, ClockStream
@@ -24,8 +25,7 @@ HOLD_NS = 400_000_000
 UNKNOWN_SKEW_PPM = 100.0
 
 
-@dataclass(frozen=True, slots=True)
-class Stamped:
+class Stamped(Struct, frozen=True, eq=False):
     """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock.
 
     arrival_ns: when it came, its device's latency not taken off.

@@ -171,8 +171,11 @@ class _Watch:
         self._bytes += count
         self._fixes = fixes
 
-    def __call__(self, arrival_ns: int) -> Iterator[DeviceEvent]:
+    def __call__(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
         """What there is to tell."""
+        return tuple(self._events(arrival_ns))
+
+    def _events(self, arrival_ns: int) -> Iterator[DeviceEvent]:
         yield from self._date()
         yield from self._load(arrival_ns)
         for fix in self._fixes:

@@ -1,7 +1,7 @@
 """MicroStrain (LORD, HBK) sensors on a serial port, configured at start and read as MIP."""
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 from msgspec import Meta
@@ -144,17 +144,18 @@ class MicrostrainDriver(SerialDriver[MipDecoder]):
         self._gps_was_valid = False
         return (self._gps,)
 
-    def _gps(self, arrival_ns: int) -> Iterator[DeviceEvent]:
+    def _gps(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
         """GPS time is noted and never used: it reads as the time since the start until there is a fix."""
         self._decoder.replies.clear()
         if self._decoder.gps_time is None:
-            return
+            return ()
         ticks, gps = self._decoder.gps_time
         is_valid = gps.flags & GPS_IS_VALID == GPS_IS_VALID
-        if is_valid != self._gps_was_valid:
-            self._gps_was_valid = is_valid
-            state = f"week {gps.week}, {gps.time_of_week_s:.6f} s" if is_valid else "not valid any more"
-            yield DeviceEvent("info", f"{self.where}: GPS time at device time {ticks}: {state}")
+        if is_valid == self._gps_was_valid:
+            return ()
+        self._gps_was_valid = is_valid
+        state = f"week {gps.week}, {gps.time_of_week_s:.6f} s" if is_valid else "not valid any more"
+        return (DeviceEvent("info", f"{self.where}: GPS time at device time {ticks}: {state}"),)
 
 
 DRIVER = DriverType(config=MicrostrainConfig, create=MicrostrainDriver)

@@ -1,6 +1,6 @@
 """VectorNav sensors on a serial port, set up by their registers and read in binary or as ASCII lines."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from operator import xor
 from typing import Annotated, Literal
@@ -127,11 +127,12 @@ class VectornavDriver(SerialDriver[VectornavDecoder]):
     def _watches(self) -> Sequence[Watch]:
         return (self._replies,)
 
-    def _replies(self, arrival_ns: int) -> Iterator[DeviceEvent]:
-        while self._decoder.replies:
-            line = self._decoder.replies.popleft()
-            if line.startswith("$VNERR"):
-                yield DeviceEvent("warning", f"{self.where}: the device reports {_error_text(line)}")
+    def _replies(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
+        if not self._decoder.replies:
+            return ()
+        errors = [_error_text(line) for line in self._decoder.replies if line.startswith("$VNERR")]
+        self._decoder.replies.clear()
+        return tuple(DeviceEvent("warning", f"{self.where}: the device reports {error}") for error in errors)
 
 
 DRIVER = DriverType(config=VectornavConfig, create=VectornavDriver)

@@ -1,7 +1,7 @@
 """Xsens MTi inertial sensors on a serial port, configured at start and read as MTData2."""
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 from msgspec import Meta
@@ -150,13 +150,17 @@ class XsensDriver(SerialDriver[Mtdata2Decoder]):
     def _watches(self) -> Sequence[Watch]:
         return (self._replies,)
 
-    def _replies(self, arrival_ns: int) -> Iterator[DeviceEvent]:
-        while self._decoder.replies:
-            message_id, payload = self._decoder.replies.popleft()
+    def _replies(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
+        if not self._decoder.replies:
+            return ()
+        texts = []
+        for message_id, payload in self._decoder.replies:
             if message_id == ERROR:
-                yield DeviceEvent("warning", f"{self.where}: the device reports {_error_text(payload)}")
+                texts.append(f"{self.where}: the device reports {_error_text(payload)}")
             elif message_id == WAKE_UP:
-                yield DeviceEvent("warning", f"{self.where}: the device has started anew")
+                texts.append(f"{self.where}: the device has started anew")
+        self._decoder.replies.clear()
+        return tuple(DeviceEvent("warning", text) for text in texts)
 
 
 DRIVER = DriverType(config=XsensConfig, create=XsensDriver)

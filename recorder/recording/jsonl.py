@@ -13,7 +13,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -125,10 +124,12 @@ def imu_lines(time_ns: int, sample: ImuSample) -> list[tuple[str, bytes]]:
         ("magnetometer", sample.mag_ut),
         ("imuTemperature", None if sample.temperature_k is None else (sample.temperature_k,)),
     )
-    present = [SensorValues(kind, values) for kind, values in sensors if values is not None]
-    if not all(map(math.isfinite, chain.from_iterable([sensor.values for sensor in present]))):
-        return []
-    return [(sensor.type, encode_json(SensorLine(sensor, time_s))) for sensor in present]
+    lines = [
+        (kind, encode_json(SensorLine(SensorValues(kind, values), time_s)))
+        for kind, values in sensors
+        if values is not None
+    ]
+    return [] if any(b"null" in line for _, line in lines) else lines  # what is not finite becomes null
 
 
 def fix_line(time_ns: int, fix: FixSample) -> bytes | None:
@@ -203,7 +204,7 @@ class LineWriter:
         self._thread = start_thread("jsonl", self._run, self._failed)
 
     def put(self, line: Pending, *, late: bool = False) -> None:
-        """Take the next line; waits when the disk is far behind."""
+        """Take the next line, or lines; waits when the disk is far behind."""
         self._queue.put((line, late), len(line) if isinstance(line, bytes) else LINE_BYTES)
 
     def _run(self) -> None:
@@ -230,10 +231,14 @@ class LineWriter:
             if line is not None:
                 (late_lines if late else lines).append(line + b"\n")
         if lines:
-            self._file.write(b"".join(lines))
+            self._write(self._file, lines)
         if late_lines:
-            self._open_late_file().write(b"".join(late_lines))
-        self.written_lines += len(lines) + len(late_lines)
+            self._write(self._open_late_file(), late_lines)
+
+    def _write(self, file: HashedFile, lines: list[bytes]) -> None:
+        data = b"".join(lines)
+        file.write(data)
+        self.written_lines += data.count(b"\n")
 
     def _finished(self, pending: Pending) -> bytes | None:
         if isinstance(pending, bytes):

@@ -45,7 +45,8 @@ class ByteQueue(Generic[T]):
         self._items: deque[tuple[T, int]] = deque()
         self._bytes = 0
         self._closed = False
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
 
     @property
     def waiting_bytes(self) -> int:
@@ -54,7 +55,7 @@ class ByteQueue(Generic[T]):
 
     def offer(self, item: T, size: int) -> bool:
         """Take the item if there is room; False when there is not."""
-        with self._changed:
+        with self._lock:
             if self._items and self._bytes + size > self._limit:
                 return False
             self._append(item, size)
@@ -62,12 +63,12 @@ class ByteQueue(Generic[T]):
 
     def force(self, item: T) -> None:
         """Take an item so small that it is not counted."""
-        with self._changed:
+        with self._lock:
             self._append(item, 0)
 
     def put(self, item: T, size: int) -> None:
         """Take the item, waiting for room; after `close` nothing waits any more."""
-        with self._changed:
+        with self._lock:
             while self._items and self._bytes + size > self._limit and not self._closed:
                 self._changed.wait()
             self._append(item, size)
@@ -80,7 +81,7 @@ class ByteQueue(Generic[T]):
 
     def get_all(self, timeout_s: float) -> list[T]:
         """All that waits; empty after `timeout_s` without any."""
-        with self._changed:
+        with self._lock:
             if not self._items and not self._closed:
                 self._changed.wait(timeout_s)
             items = [item for item, _ in self._items]
@@ -91,14 +92,14 @@ class ByteQueue(Generic[T]):
 
     def close(self) -> None:
         """No more is coming: the consumer ends when the queue is empty."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             self._changed.notify_all()
 
     @property
     def ended(self) -> bool:
         """Closed and empty."""
-        with self._changed:
+        with self._lock:
             return self._closed and not self._items
 
 
@@ -107,19 +108,31 @@ class HashedFile:
 
     def __init__(self, path: Path, buffer_bytes: int = 1 << 17) -> None:
         """Create the file; it must not exist."""
-        self._file = path.open("xb", buffering=buffer_bytes)
+        self._file = path.open("xb", buffering=0)
         self._hash = hashlib.sha256()
         self._size = 0
+        self._limit = buffer_bytes
+        self._held: list[bytes | memoryview] = []
+        self._held_bytes = 0
 
     def write(self, data: bytes | memoryview) -> None:
-        """Append bytes."""
-        self._file.write(data)
-        self._hash.update(data)
-        self._size += len(data)
+        """Append bytes, which must not change any more."""
+        self._held.append(data)
+        self._held_bytes += len(data)
+        if self._held_bytes >= self._limit:
+            self.flush()
 
     def flush(self) -> None:
-        """Hand what is buffered to the system: it survives SIGKILL."""
-        self._file.flush()
+        """Hand what is buffered to the system: it survives SIGKILL. What the system does not take stays buffered."""
+        left = memoryview(self._held[0] if len(self._held) == 1 else b"".join(self._held))
+        try:
+            while left:
+                count = self._file.write(left)
+                self._hash.update(left[:count])
+                self._size += count
+                left = left[count:]
+        finally:
+            self._held, self._held_bytes = ([left] if left else []), len(left)
 
     def sync(self) -> None:
         """Make what was flushed survive power loss."""
@@ -132,7 +145,7 @@ class HashedFile:
     def close(self) -> FileEntry:
         """Close durably; gives size and hash."""
         try:
-            self._file.flush()
+            self.flush()
             os.fsync(self._file.fileno())
         finally:
             self._file.close()

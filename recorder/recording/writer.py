@@ -117,11 +117,13 @@ class RecordingWriter:
     def write_imu(self, device: str, time_ns: int, sample: ImuSample, *, late: bool = False) -> bool:
         """One line per sensor of the sample, counted for its device; False when a value is not a number."""
         lines = imu_lines(time_ns, sample)
+        if not lines:
+            return False
         counts = self.manifest.devices[device].stream.sensor_lines
-        for sensor, line in lines:
-            self._lines.put(line, late=late)
+        for sensor, _ in lines:
             counts[sensor] = counts.get(sensor, 0) + 1
-        return bool(lines)
+        self._lines.put(b"\n".join([line for _, line in lines]), late=late)
+        return True
 
     def write_fix(self, time_ns: int, fix: FixSample, *, late: bool = False) -> bool:
         """A gps line; False when the fix lacks what the format needs."""

@@ -12,9 +12,11 @@ import pytest
 from drivers import device
 from drivers.device import received
 from drivers.imu import rvc
+from drivers.samples import ImuSample
 from drivers.serial_care import Arrivals, RateWatch
 
 RVC_BODY = bytes.fromhex("010092FF25088DFEECFFD103000000")
+SAMPLE = ImuSample(None, None, (0.0, 0.0, 9.81), None)
 CYCLES = 200
 
 
@@ -62,7 +64,7 @@ def test_other_rate_is_told_once() -> None:
     watch = RateWatch(100, "port")
     told = []
     for tenth in range(200):
-        watch.samples += 5
+        watch.note([(0, SAMPLE)] * 5)
         told += watch(tenth * 10**8)
     assert [event.text for event in told] == ["port: 50.0 samples a second come, and 100 were expected"]
 
