@@ -65,7 +65,7 @@ class Port:
 
 def find_port(path: str, system: Path = SYSTEM) -> Port:
     """Look a port up. Never raises: a port that is not known is of the kind unknown."""
-    real = os.path.realpath(path)
+    real = _real_path(path)
     name = Path(real).name
     if real.startswith("/dev/pts/"):
         return Port(path, "pty")
@@ -83,8 +83,8 @@ def usb_controller(path: str, system: Path = SYSTEM) -> str | None:
 
     Ports of one controller and speed are polled at the same times (USB 2.0, section 4.4: frames of 1 ms, microframes).
     """
-    name = Path(os.path.realpath(path)).name
-    device = Path(os.path.realpath(system / "sys/class/tty" / name / "device"))
+    name = Path(_real_path(path)).name
+    device = Path(_real_path(system / "sys/class/tty" / name / "device"))
     speed = None
     for folder in (device, *device.parents):
         with contextlib.suppress(OSError):
@@ -94,8 +94,16 @@ def usb_controller(path: str, system: Path = SYSTEM) -> str | None:
     return None
 
 
+def _real_path(path: str | Path) -> str:
+    """Where a name leads. One that vanishes this very moment (unplugged) leads nowhere, and is no error."""
+    try:
+        return os.path.realpath(path)
+    except OSError:
+        return str(path)
+
+
 def _kind(name: str, system: Path) -> Literal["uart", "cdc", "unknown"]:
-    driver = os.path.realpath(system / "sys/class/tty" / name / "device/driver")
+    driver = _real_path(system / "sys/class/tty" / name / "device/driver")
     if name.startswith("ttyACM") or driver.endswith("/cdc_acm"):
         return "cdc"
     if name.startswith(("ttyUSB", "ttyS", "ttyAMA", "ttyTHS", "ttymxc", "ttySC", "ttyO")):
@@ -110,6 +118,6 @@ def _lasting_name(path: str, name: str, system: Path) -> str | None:
             return None
         with contextlib.suppress(OSError):
             for link in sorted((system / folder).iterdir()):
-                if Path(os.path.realpath(link)).name == name:
+                if Path(_real_path(link)).name == name:
                     return f"/{folder}/{link.name}"
     return None

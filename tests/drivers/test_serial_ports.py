@@ -105,3 +105,12 @@ def test_ports_of_one_controller_and_speed_are_polled_together(tmp_path: Path) -
     assert len(set(keys)) == 3
     assert usb_controller("/dev/ttyS0", tmp_path) is None
     assert usb_controller("/dev/pts/0", tmp_path) is None
+
+
+def test_a_name_that_vanishes_this_very_moment_is_of_no_known_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    def vanished(path: str) -> str:
+        raise FileNotFoundError(2, "No such file or directory", path)
+
+    monkeypatch.setattr("os.path.realpath", vanished)
+    assert find_port("/dev/imu").kind == "unknown"
+    assert usb_controller("/dev/imu") is None
