@@ -1,5 +1,6 @@
 """MIP decoder against what the vendor's library makes of a capture, and the driver over a pty."""
 
+import os
 import struct
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +16,11 @@ from drivers.imu.mip_decoder import MAX_PACKET_BYTES, GpsTime, MipDecoder, fletc
 from drivers.samples import ImuSample
 
 DATA = Path(__file__).parent.parent / "data" / "mip"
+CAPTURES = [(DATA / "mip_data.bin", DATA / "mip_data.txt")]
+# The whole capture, of which the above is the beginning, in a folder outside of this repository.
+if FOLDER := os.environ.get("RIGTAPE_IMU_GOLDENS", ""):
+    WHOLE = Path(FOLDER) / "mip"
+    CAPTURES.append((WHOLE / "mip_data.bin", WHOLE / "mip_data.expected_mip_sdk.txt"))
 EXAMPLE = bytes.fromhex(
     "75658034 0AD50000001CBE991A08 0E043C23D70ABCA3D70ABF800000 0E053C23D70ABCA3D70A3CF5C28F"
     "0E063E800000BDCCCCCD3ECCCCCD 7FA4"
@@ -34,17 +40,18 @@ def measurement(ticks: int) -> bytes:
     return mip(0x80, (0xD5, ticks.to_bytes(8)), ACCEL, GYRO)
 
 
-def test_agrees_with_the_vendors_parser_on_a_capture() -> None:
+@pytest.mark.parametrize(("capture", "decoded"), CAPTURES)
+def test_agrees_with_the_vendors_parser_on_a_capture(capture: Path, decoded: Path) -> None:
     decoder = MipDecoder()
     lines = []
-    for sample in decoder.feed((DATA / "mip_data.bin").read_bytes()):
+    for sample in decoder.feed(capture.read_bytes()):
         if sample.accel_m_s2 is not None:
             lines.append(("T", [sample.device_ticks]))
             lines.append(("A", [value / 9.80665 for value in sample.accel_m_s2]))
             lines.append(("G", list(sample.gyro_rad_s)))
         if sample.mag_ut is not None:
             lines.append(("M", [value / 100 for value in sample.mag_ut]))
-    expected = [line.split() for line in (DATA / "mip_data.txt").read_text().splitlines()]
+    expected = [line.split() for line in decoded.read_text().splitlines()]
     assert [kind for kind, _ in lines] == [kind for kind, *_ in expected]
     for (_, ours), (_, *theirs) in zip(lines, expected, strict=True):
         assert ours == pytest.approx(list(map(float, theirs)), rel=5e-9)

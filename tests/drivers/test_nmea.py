@@ -37,6 +37,11 @@ CAPTURES = {
     "gp-320fw-2019-04-07-coldboot": "2019-04-07",
     "nmea-fuzzy-cases": "2020-03-18",
 }
+LOGS = [DATA / f"{name}.log" for name in CAPTURES]
+# The same and more of gpsd's, with all that it says of them, in a folder outside of this repository.
+if FOLDER := os.environ.get("RIGTAPE_NMEA_GOLDENS", ""):
+    LOGS += sorted(Path(FOLDER).glob("*.log"))
+MIXED = [path for folder in (DATA, Path(FOLDER or DATA)) for path in folder.glob("*.mixed")]
 NOON = "2026-11-22T12:00:00"
 
 
@@ -66,12 +71,22 @@ def decode(data: bytes, reference: str = NOON) -> list[FixSample]:
     return decoder.feed(data) + decoder.flush()
 
 
-@pytest.mark.parametrize(("name", "day"), CAPTURES.items())
-def test_agrees_with_gpsd(name: str, day: str) -> None:
-    fixes = {fix.device_ticks: fix for fix in decode((DATA / f"{name}.log").read_bytes(), day + "T12:00:00")}
-    reports = map(json.loads, (DATA / f"{name}.log.chk").read_text().splitlines())
+def gpsds_reports(log: Path) -> list[dict[str, object]]:
+    """What gpsd says of positions; its file may hold other reports and the sentences too."""
+    (path,) = log.parent.glob(f"{log.name}.chk*")
+    lines = path.read_text("ascii", "replace").splitlines()
+    return [json.loads(line) for line in lines if line.startswith('{"class":"TPV"')]
+
+
+@pytest.mark.parametrize("log", LOGS, ids=str)
+def test_agrees_with_gpsd(log: Path) -> None:
+    name = log.stem
+    if name == "tcp-torture":
+        pytest.skip("see the next test")
+    fixes = {fix.device_ticks: fix for fix in decode(log.read_bytes(), CAPTURES.get(name, "2026-11-22") + "T12:00:00")}
     # gpsd reports several times in an epoch, the last time with everything; without a position the mode is 1.
-    expected = {utc_ns(report["time"]): report for report in reports if "time" in report and report["mode"] > 1}
+    reports = [report for report in gpsds_reports(log) if "time" in report and report["mode"] > 1]
+    expected = {utc_ns(report["time"]): report for report in reports}
     if "coldboot" in name:  # before the first date gpsd gives a position without a time; we know the day
         del fixes[utc_ns("2019-04-07T00:03:43.030")]
     assert expected
@@ -86,11 +101,34 @@ def test_agrees_with_gpsd(name: str, day: str) -> None:
             assert fix.undulation_m == pytest.approx(report["geoidSep"], abs=0.006)
 
 
-def test_sentences_between_binary_messages() -> None:
-    data = (DATA / "ublox-zed-f9p.mixed").read_bytes()
+@pytest.mark.parametrize(
+    "log", [log for log in (DATA / "tcp-torture.log", *LOGS) if log.stem == "tcp-torture"], ids=str
+)
+def test_agrees_with_gpsd_on_sentences_that_come_in_pieces(log: Path) -> None:
+    # A bar is a pause. gpsd goes over to the coarser position of RMC when it comes; GGA's is in its first report.
+    pieces = log.read_bytes().split(b"|")
+    decoder = NmeaDecoder(utc_ns("2026-11-22T12:00:00"))
+    fixes = [fix for piece in pieces for fix in decoder.feed(piece)] + decoder.flush()
+    first, *_, last = gpsds_reports(log)
+    assert [
+        (fix.device_ticks, fix.latitude_deg, fix.longitude_deg, fix.altitude_m, fix.undulation_m) for fix in fixes
+    ] == [
+        (
+            utc_ns(last["time"]),
+            pytest.approx(first["lat"], abs=2e-8),
+            pytest.approx(first["lon"], abs=2e-8),
+            pytest.approx(last["altMSL"], abs=0.006),
+            pytest.approx(last["geoidSep"], abs=0.006),
+        )
+    ]
+
+
+@pytest.mark.parametrize("log", MIXED, ids=str)
+def test_sentences_between_binary_messages(log: Path) -> None:
+    data = log.read_bytes()
     decoder = NmeaDecoder(utc_ns("2019-04-12T00:00:00"))
     fixes = decoder.feed(data) + decoder.flush()
-    assert len(fixes) == 13 == data.count(b"$GNGGA")
+    assert len(fixes) == data.count(b"$GNGGA") >= 13
     # The capture begins inside of a binary message; from the first sentence on nothing is garbage.
     whole = NmeaDecoder(utc_ns("2019-04-12T00:00:00"))
     whole.feed(data[data.index(b"$GNRMC") :])

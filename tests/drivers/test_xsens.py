@@ -67,6 +67,23 @@ def test_agrees_with_another_decoder_on_captures(capture: str) -> None:
     assert (decoder.bad_frames, decoder.skipped_bytes, decoder.lost_messages) == (0, 0, 0)
 
 
+def test_agrees_with_mt_manager_on_packets_of_another_model() -> None:
+    packets = (DATA / "mti300.txt").read_text().strip().split("\n\n")
+    assert len(packets) == 6
+    for packet in packets:
+        payload, decoded = packet.split("\n")
+        sample = decode_mtdata2(bytes.fromhex(payload), 1.0)
+        items = re.findall(r"\((\w+)[|\w]*, \d+ bytes, \(?([^)]*)\)", decoded)
+        expected = {kind: [float(word) for word in re.findall(r"(?<!\w)-?[\d.]+", numbers)] for kind, numbers in items}
+        assert [sample.sequence] == expected["PacketCounter"]
+        assert [sample.device_ticks] == expected["SampleTimeFine"]
+        assert list(sample.accel_m_s2 or ()) == pytest.approx(expected.get("Acceleration", []), abs=5e-9)
+        assert list(sample.gyro_rad_s or ()) == pytest.approx(expected.get("RateOfTurn", []), abs=5e-9)
+        assert list(sample.mag_ut or ()) == pytest.approx(expected.get("MagneticField", []), abs=5e-9)
+        celsius = [] if sample.temperature_k is None else [sample.temperature_k - 273.15]
+        assert celsius == pytest.approx(expected.get("Temperature", []), abs=1e-12)
+
+
 def test_time_of_samples_ascends_in_spite_of_gnss_packets() -> None:
     for capture in "1234":
         ticks = [sample.device_ticks for sample in Mtdata2Decoder().feed((DATA / f"{capture}.bin").read_bytes())]
