@@ -4,6 +4,7 @@ The only module that imports numba. Each loop is compiled once and kept on disk;
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -36,6 +37,36 @@ def _compiled(function: Function) -> Function:
     return cast(Function, made)
 
 
+@cache
+def packet_dtype(model: SequencedModel) -> np.dtype[np.void]:
+    """A packet's layout: so the loop reads each field at once. Its numbers lie there as if they were little-endian."""
+    first = ["radius", "pitch", "yaw"] if model.geometry == "polar" else ["radius", "x", "y", "z"]
+    channel = np.dtype(
+        {
+            "names": [*first, "intensity"],
+            "formats": ["<u2"] * len(first) + ["u1"],
+            "offsets": list(range(0, 2 * len(first) + 1, 2)),
+            "itemsize": model.channel_bytes,
+        }
+    )
+    block = np.dtype(
+        {
+            "names": ["offset_us", "channels"],
+            "formats": [("u1", (model.offset_bytes,)), (channel, (model.channels,))],
+            "offsets": [0, model.first_channel],
+            "itemsize": model.block_bytes,
+        }
+    )
+    return np.dtype(
+        {
+            "names": ["seconds", "microseconds", "blocks"],
+            "formats": [("u1", (6,)), ("u1", (4,)), (block, (model.blocks,))],
+            "offsets": [10, 16, model.header_bytes],
+            "itemsize": model.packet_bytes,
+        }
+    )
+
+
 def decode(
     model: SequencedModel,
     packets: Bytes,
@@ -45,122 +76,70 @@ def decode(
 ) -> int:
     """Decode (n, packet_bytes) packets into `points`, which has room for all; gives the number of points written.
 
-    tables: range, sine and cosine by the field's two bytes read little-endian.
+    packets: C-contiguous. tables: range, sine and cosine by the field's two bytes read little-endian.
     """
     loop = _polar_loop if model.geometry == "polar" else _vector_loop
-    layout = (
-        model.header_bytes, model.blocks, model.block_bytes, model.channels, model.channel_bytes, model.offset_bytes,
-        model.first_channel,
-    )  # fmt: skip
-    return loop(packets, layout, *tables, points, keep_invalid)
+    return loop(packets.reshape(-1).view(packet_dtype(model)), *tables, points, keep_invalid)
 
 
 @_compiled
-def _packet_s(packet: Bytes) -> float:
-    seconds = microseconds = 0
-    for at in range(10, 16):
-        seconds = seconds * 256 + packet[at]
-    for at in range(16, 20):
-        microseconds = microseconds * 256 + packet[at]
-    return (seconds * 1_000_000 + microseconds) * 1e-6
+def _number(field: Bytes) -> int:
+    number = 0
+    for byte in field:
+        number = number * 256 + byte
+    return number
 
 
 @_compiled
-def _offset_us(packet: Bytes, at: int, offset_bytes: int) -> int:
-    if offset_bytes == 1:
-        return int(packet[at])
-    return int(packet[at]) * 256 + int(packet[at + 1])
+def _component(field: int) -> np.float32:
+    return np.float32(np.int16((field & 0xFF) << 8 | field >> 8))
+
+
+# Each point is written to where the next valid one belongs: a branch for those of no return would be guessed wrongly.
 
 
 @_compiled
-def _little(packet: Bytes, at: int) -> int:
-    return int(packet[at]) | int(packet[at + 1]) << 8
-
-
-@_compiled
-def _component(packet: Bytes, at: int) -> np.float32:
-    return np.float32(np.int16(int(packet[at]) << 8 | int(packet[at + 1])))
-
-
-@_compiled
-def _polar_loop(
-    packets: Bytes,
-    layout: tuple[int, int, int, int, int, int, int],
-    range_m: Table,
-    sine: Table,
-    cosine: Table,
-    points: Any,
-    keep_invalid: bool,
-) -> int:
-    header_bytes, blocks, block_bytes, channels, channel_bytes, offset_bytes, first_channel = layout
+def _polar_loop(packets: Any, range_m: Table, sine: Table, cosine: Table, points: Any, keep_invalid: bool) -> int:
     written = 0
-    for number in range(len(packets)):
-        packet = packets[number]
-        packet_s = _packet_s(packet)
-        at = header_bytes
-        for _ in range(blocks):
-            point_s = packet_s + _offset_us(packet, at, offset_bytes) * 1e-6
-            place = at + first_channel
-            at += block_bytes
-            for channel in range(channels):
-                distance = range_m[_little(packet, place)]
+    for packet in packets:
+        packet_s = (_number(packet.seconds) * 1_000_000 + _number(packet.microseconds)) * 1e-6
+        for block in packet.blocks:
+            point_s = packet_s + _number(block.offset_us) * 1e-6
+            for ring in range(len(block.channels)):
+                channel = block.channels[ring]
+                distance = range_m[channel.radius]
                 is_valid = distance == distance  # false for NaN
-                if is_valid or keep_invalid:
-                    point = points[written]
-                    written += 1
-                    point.ring = channel
-                    point.timestamp = point_s
-                    if is_valid:
-                        pitch, yaw = _little(packet, place + 2), _little(packet, place + 4)
-                        level_m = distance * cosine[pitch]
-                        point.x = level_m * cosine[yaw]
-                        point.y = level_m * sine[yaw]
-                        point.z = distance * sine[pitch]
-                        point.intensity = packet[place + 6]
-                    else:
-                        point.x = point.y = point.z = distance
-                        point.intensity = 0
-                place += channel_bytes
+                level_m = distance * cosine[channel.pitch]
+                point = points[written]
+                point.x = level_m * cosine[channel.yaw]
+                point.y = level_m * sine[channel.yaw]
+                point.z = distance * sine[channel.pitch]
+                point.intensity = channel.intensity * is_valid
+                point.ring = ring
+                point.timestamp = point_s
+                written += is_valid | keep_invalid
     return written
 
 
 @_compiled
-def _vector_loop(
-    packets: Bytes,
-    layout: tuple[int, int, int, int, int, int, int],
-    range_m: Table,
-    sine: Table,
-    cosine: Table,
-    points: Any,
-    keep_invalid: bool,
-) -> int:
-    header_bytes, blocks, block_bytes, channels, channel_bytes, offset_bytes, first_channel = layout
+def _vector_loop(packets: Any, range_m: Table, sine: Table, cosine: Table, points: Any, keep_invalid: bool) -> int:
     written = 0
-    for number in range(len(packets)):
-        packet = packets[number]
-        packet_s = _packet_s(packet)
-        at = header_bytes
-        for _ in range(blocks):
-            point_s = packet_s + _offset_us(packet, at, offset_bytes) * 1e-6
-            place = at + first_channel
-            at += block_bytes
-            for channel in range(channels):
-                distance = range_m[_little(packet, place)]
+    for packet in packets:
+        packet_s = (_number(packet.seconds) * 1_000_000 + _number(packet.microseconds)) * 1e-6
+        for block in packet.blocks:
+            point_s = packet_s + _number(block.offset_us) * 1e-6
+            for ring in range(len(block.channels)):
+                channel = block.channels[ring]
+                distance = range_m[channel.radius]
                 is_valid = distance == distance  # false for NaN
-                if is_valid or keep_invalid:
-                    point = points[written]
-                    written += 1
-                    point.ring = channel
-                    point.timestamp = point_s
-                    if is_valid:
-                        point.x = _component(packet, place + 2) * distance / FULL
-                        point.y = _component(packet, place + 4) * distance / FULL
-                        point.z = _component(packet, place + 6) * distance / FULL
-                        point.intensity = packet[place + 8]
-                    else:
-                        point.x = point.y = point.z = distance
-                        point.intensity = 0
-                place += channel_bytes
+                point = points[written]
+                point.x = _component(channel.x) * distance / FULL
+                point.y = _component(channel.y) * distance / FULL
+                point.z = _component(channel.z) * distance / FULL
+                point.intensity = channel.intensity * is_valid
+                point.ring = ring
+                point.timestamp = point_s
+                written += is_valid | keep_invalid
     return written
 
 
