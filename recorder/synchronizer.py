@@ -1,5 +1,8 @@
 """Pairs the pictures of synchronised cameras and merges all streams into time order: pure, no clock, no thread.
 
+The pictures of one camera keep the order in which they came, whatever their clock says: one that is coded as what
+differs from its forerunner cannot be decoded before it.
+
 Items wait until the watermark has passed their time; the caller moves it (usually: now minus a fixed window). What
 comes after the watermark passed its time is given out at once and marked late.
 """
@@ -30,6 +33,17 @@ class FrameSet(Generic[P]):
     group: int = 0
 
 
+@dataclass(slots=True)
+class _LastTimes:
+    """Times of the last two frame sets that hold a picture of a camera."""
+
+    last_ns: int = -(1 << 62)
+    before_ns: int = -(1 << 62)
+
+    def add(self, time_ns: int) -> None:
+        self.before_ns, self.last_ns = self.last_ns, time_ns
+
+
 class Released(Struct, Generic[T, P], frozen=True):
     """One item in its turn. late: items of a later time were given out before."""
 
@@ -54,6 +68,11 @@ class Synchronizer(Generic[T, P]):
     _watermark_ns: int | None = None
     _open_sets: deque[tuple[int, FrameSet[P]]] = field(default_factory=deque)
     _given_out: deque[tuple[int, int, int]] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SETS))
+    _times: list[_LastTimes] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """No camera has a picture yet."""
+        self._times = [_LastTimes() for _ in range(self.cameras)]
 
     def add(self, time_ns: int, item: T) -> None:
         """Take an item of any stream but cameras."""
@@ -65,9 +84,10 @@ class Synchronizer(Generic[T, P]):
         Gives the time of its frame set.
         """
         group = self.group_of[camera] if self.group_of else 0
+        own = self._times[camera]
         for set_time_ns, frame_set in reversed(self._open_sets):
             if frame_set.group == group and abs(frame_set.device_ns - device_ns) < self.pair_within_ns:
-                if frame_set.pictures[camera] is None:
+                if frame_set.pictures[camera] is None and set_time_ns > own.last_ns:
                     return self._join(frame_set, set_time_ns, camera, device_ns, time_ns, picture)
                 break  # a second picture of one camera within half a period: kept as a set of its own
         frame_set = FrameSet(device_ns, [None] * self.cameras, group)
@@ -78,8 +98,20 @@ class Synchronizer(Generic[T, P]):
                 break
         else:
             time_ns = self._between_neighbours(group, device_ns, time_ns)
+        if picture is not None:
+            if time_ns <= own.last_ns:
+                time_ns = self._free_after(own.last_ns)
+            own.add(time_ns)
         self._open_sets.append((time_ns, frame_set))
         self._push(time_ns, frame_set)
+        return time_ns
+
+    def _free_after(self, time_ns: int) -> int:
+        """A time soon after that one which no set has: pictures of one time are taken for those of one instant."""
+        taken = {set_time_ns for set_time_ns, _ in self._open_sets} | {its_ns for _, _, its_ns in self._given_out}
+        time_ns += ORDER_STEP_NS
+        while time_ns in taken:
+            time_ns += ORDER_STEP_NS
         return time_ns
 
     def _join(
@@ -87,20 +119,33 @@ class Synchronizer(Generic[T, P]):
     ) -> int:
         """Put a picture into a set that waits; gives the set's time.
 
-        Where cameras are not triggered together, it is the time of the first of them that counts, as for clients.
+        Where cameras are not triggered together, it is the time of the first of them that counts, as for clients;
+        unless that would change the order of a camera's pictures.
         """
-        is_first = all(other is None for other in joined.pictures[:camera])
-        joined.pictures[camera] = picture
-        if picture is None or not is_first or abs(joined.device_ns - device_ns) < TOGETHER_NS:
+        if picture is None:
             return set_time_ns
-        self._open_sets = deque(entry for entry in self._open_sets if entry[1] is not joined)
-        self._heap = [entry for entry in self._heap if entry[2] is not joined]
+        partners = [self._times[other] for other, its in enumerate(joined.pictures) if its is not None]
+        is_first = all(its is None for its in joined.pictures[:camera])
+        joined.pictures[camera] = picture
+        if is_first and abs(joined.device_ns - device_ns) >= TOGETHER_NS:
+            moved_ns = self._between_neighbours(joined.group, device_ns, time_ns)
+            previous_ns = [self._times[camera].last_ns, *(times.before_ns for times in partners)]
+            if moved_ns > max(previous_ns) and all(times.last_ns == set_time_ns for times in partners):
+                self._move(joined, device_ns, moved_ns)
+                for times in partners:
+                    times.last_ns = moved_ns
+                set_time_ns = moved_ns
+        self._times[camera].add(set_time_ns)
+        return set_time_ns
+
+    def _move(self, moved: FrameSet[P], device_ns: int, time_ns: int) -> None:
+        """Have a set that waits go out at another time."""
+        self._open_sets = deque(entry for entry in self._open_sets if entry[1] is not moved)
+        self._heap = [entry for entry in self._heap if entry[2] is not moved]
         heapq.heapify(self._heap)
-        time_ns = self._between_neighbours(joined.group, device_ns, time_ns)
-        joined.device_ns = device_ns
-        self._open_sets.append((time_ns, joined))
-        self._push(time_ns, joined)
-        return time_ns
+        moved.device_ns = device_ns
+        self._open_sets.append((time_ns, moved))
+        self._push(time_ns, moved)
 
     def _between_neighbours(self, group: int, device_ns: int, time_ns: int) -> int:
         """Keep sets of a group in the order of their device times, which mapped times of two cameras may contradict.
