@@ -24,6 +24,7 @@ from av.video.stream import VideoStream
 from drivers.samples import DeviceEvent, FrameSample, VideoFormat
 from recorder.recording.encoder import RAW, Encoder, EncoderError, PictureError, VideoSettings, choose_encoder
 from recorder.recording.matroska import MILLISECONDS, MatroskaFile
+from recorder.recording.packets import PacketCheck
 from recorder.recording.work import ByteQueue, Ticket, start_thread
 
 QUEUE_BYTES = 64 << 20
@@ -61,6 +62,7 @@ class VideoWriter:
         self._on_error = on_error
         self._on_event = on_event
         self._format: VideoFormat | None = None
+        self._packets: PacketCheck | None = None
         self._file: MatroskaFile | None = None
         self._encoder: Encoder | None = None
         self._encoding: deque[tuple[int, Ticket]] = deque()
@@ -146,6 +148,11 @@ class VideoWriter:
             )
         if self._wait_for_keyframe and not frame.is_keyframe:
             return "pictures up to the next key frame are left out too"
+        if frame.video.codec != RAW:
+            self._packets = self._packets or PacketCheck(frame.video.codec)
+            if fault := self._packets.fault(frame.packet):
+                self._wait_for_keyframe = True
+                return fault
         self._wait_for_keyframe = False
         return None
 
