@@ -18,6 +18,7 @@ from calibration.sources import (
     BROWN_COUNT,
     FloatArray,
     Imported,
+    image_size,
     inverted,
     make_camera,
     numbers,
@@ -29,7 +30,7 @@ from calibration.sources import (
 SOCKETS = {f"CAM_{letter}": number for number, letter in enumerate("ABCDEFGH")}
 PERSPECTIVE, FISHEYE = 0, 1
 METRES_PER_CM = 0.01
-NO_IMU = "where the IMU is is not in the device's memory"
+NO_IMU = "the device's memory does not tell where the IMU is"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,22 @@ def read_eeprom(path: Path) -> dict[str, Any]:
     if not isinstance(eeprom, dict) or "cameraData" not in eeprom:
         raise CalibrationError(f"{path}: no EEPROM of an OAK: it has no cameraData")
     return eeprom
+
+
+def read_lens(path: Path) -> OakCamera:
+    """A camera by what the device says of the lens for the very pictures recorded (`raw/*.lens.json` of a recording).
+
+    Raises CalibrationError.
+    """
+    try:
+        lens = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise CalibrationError(f"{path}: not valid JSON: {error}") from error
+    if not isinstance(lens, dict):
+        raise CalibrationError(f"{path}: must be an object")
+    width, height = image_size([lens.get("imageWidth"), lens.get("imageHeight")], f"{path}: imageWidth, imageHeight")
+    matrix = square(lens.get("intrinsicMatrix"), f"{path}: intrinsicMatrix", 3)
+    return OakCamera(str(lens.get("socket")), width, height, matrix)
 
 
 def from_eeprom(eeprom: dict[str, Any], cameras: list[OakCamera]) -> Imported:

@@ -10,7 +10,10 @@ from calibration import fourseasons, kalibr, oak, opencv_yaml
 from calibration.model import CalibrationError, load_calibration
 from calibration.sources import Imported, place
 from recorder.errors import ConfigError
+from recorder.recording.manifest import needed_manifest
+from recorder.recording.raw import FOLDER as RAW_FOLDER
 
+EEPROM_SUFFIX, LENS_SUFFIX = ".eeprom.json", ".lens.json"  # of drivers.cameras.oak in raw/
 FORMATS = ("kalibr", "oak", "4seasons", "opencv", "spectacular-ai")
 UNKNOWN_IMU = (kalibr.NO_IMU, oak.NO_IMU, opencv_yaml.NO_IMU)
 
@@ -19,12 +22,13 @@ UNKNOWN_IMU = (kalibr.NO_IMU, oak.NO_IMU, opencv_yaml.NO_IMU)
 class Choices:
     """What a source may leave open; each belongs to some formats only.
 
-    size: of the pictures. sockets: cameras of an OAK. images: of 4Seasons. model: of OpenCV's four coefficients.
-    unit: of OpenCV's T.
+    size: of the pictures. sockets: cameras of an OAK. first_socket: which one camera 0 must be, as the place of the IMU
+    is known of that. images: of 4Seasons. model: of OpenCV's four coefficients. unit: of OpenCV's T.
     """
 
     size: tuple[int, int] | None = None
     sockets: tuple[str, ...] = ()
+    first_socket: str | None = None
     images: str | None = None
     model: str | None = None
     unit: str = "m"
@@ -35,7 +39,7 @@ def import_calibration(
 ) -> Imported:
     """Read a calibration of another program. camera_from_imu: (4, 4) of camera 0, in place of the source's own.
 
-    Raises ConfigError: what cannot be read, or what must be said and was not.
+    Raises RecorderError: what cannot be read, or what must be said and was not.
     """
     try:
         imported = _read(sources, kind, choices)
@@ -70,9 +74,31 @@ def _read(sources: list[Path], kind: str, choices: Choices) -> Imported:
 
 
 def _read_oak(source: Path, choices: Choices) -> Imported:
-    eeprom = oak.read_eeprom(source)
-    sockets = choices.sockets or tuple(oak.stereo_sockets(eeprom))
-    wanted = [oak.OakCamera(socket, *(choices.size or oak.full_size(eeprom, socket))) for socket in sockets]
+    if source.is_dir():
+        if choices.size or choices.sockets:
+            raise ConfigError("--size and --socket are for an EEPROM alone; a recording knows its pictures")
+        eeprom_path, wanted = _recorded_oak(source)
+        eeprom = oak.read_eeprom(eeprom_path)
+    else:
+        eeprom = oak.read_eeprom(source)
+        sockets = choices.sockets or tuple(oak.stereo_sockets(eeprom))
+        wanted = [oak.OakCamera(socket, *(choices.size or oak.full_size(eeprom, socket))) for socket in sockets]
     if not wanted:
         raise ConfigError(f"{source}: no camera on a socket that is known; give --socket")
+    if choices.first_socket not in (None, wanted[0].socket):
+        raise ConfigError(
+            f"where the IMU is as designed is known of {choices.first_socket}, camera 0 is {wanted[0].socket}: "
+            f"give --socket {choices.first_socket} first, or another place of the IMU"
+        )
     return oak.from_eeprom(eeprom, wanted)
+
+
+def _recorded_oak(folder: Path) -> tuple[Path, list[oak.OakCamera]]:
+    """The EEPROM that a recording keeps, and the cameras in the order of their videos. Raises RecorderError."""
+    found = sorted((folder / RAW_FOLDER).glob(f"*{EEPROM_SUFFIX}"))
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found) or "none"
+        raise ConfigError(f"{folder}: the memory of one OAK is needed in raw/, there is: {names}")
+    device = found[0].name.removesuffix(EEPROM_SUFFIX)
+    cameras = [name for name in needed_manifest(folder).cameras if name.startswith(f"{device}.")]
+    return found[0], [oak.read_lens(folder / RAW_FOLDER / f"{name}{LENS_SUFFIX}") for name in cameras]

@@ -294,7 +294,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
 @click.argument("sources", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--format", "kind", type=click.Choice(FORMATS), required=True, help="Who wrote SOURCES.")
 @click.option("-o", "--output", type=NewFile, required=True, help="The calibration.json to write.")
-@click.option("--size", type=SizeType(), help="Size of the pictures (oak: default the sensor's; opencv).")
+@click.option("--size", type=SizeType(), help="Size of the pictures (oak's EEPROM: default the sensor's; opencv).")
 @click.option("--socket", "sockets", multiple=True, metavar="CAM_B", help="oak: a camera, in their order (repeatable).")
 @click.option("--images", type=click.Choice(IMAGES), help="4seasons: which images the recording has.")
 @click.option("--model", type=click.Choice(MODELS[:2]), help="opencv: the lens, where four numbers leave it open.")
@@ -317,23 +317,23 @@ def import_(
 ) -> None:
     """Make a calibration.json of what other programs or devices know.
 
-    kalibr: camchain(-imucam).yaml, and imu.yaml if you like; oak: the EEPROM as JSON; 4seasons: the calibration
-    folder; opencv: files of cv2.FileStorage (or ROS camera_info); spectacular-ai: another calibration.json. With the
-    --imu options all cameras are moved together, so that camera 0 is where you say.
+    kalibr: camchain(-imucam).yaml, and imu.yaml if you like; oak: a recording of one, or its EEPROM as JSON;
+    4seasons: the calibration folder; opencv: files of cv2.FileStorage (or ROS camera_info); spectacular-ai: another
+    calibration.json. With the --imu options all cameras are moved together, so that camera 0 is where you say.
 
     \b
     Examples:
       rigtape calibrate import camchain-imucam.yaml imu.yaml --format kalibr -o calibration.json
+      rigtape calibrate import demo/oak-take --format oak --imu-to-camera oak-d-pro-w -o calibration.json
       rigtape calibrate import eeprom.json --format oak --size 640x400 --imu-to-camera oak-d-pro-w -o calibration.json
       rigtape calibrate import calibration/ --format 4seasons --images undistorted -o calibration.json
       rigtape calibrate import intrinsics.yml extrinsics.yml --format opencv --size 1280x800 --unit mm \\
           --imu-axes forward,left,up --imu-translation 0 0.05 0 -o calibration.json
     """
     with clear_errors(verbose):
-        if imu_to_camera in AS_DESIGNED and kind == "oak" and sockets and sockets[0] != "CAM_B":
-            raise ConfigError(f"--imu-to-camera {imu_to_camera}: is known of CAM_B; give --socket CAM_B first")
         pose = camera_from_imu(imu_to_camera, imu_axes, imu_translation)
-        choices = Choices(size, sockets, images, model, unit)
+        first_socket = f"CAM_{AS_DESIGNED[imu_to_camera].camera}" if imu_to_camera in AS_DESIGNED else None
+        choices = Choices(size, sockets, first_socket, images, model, unit)
         imported = import_calibration(list(sources), kind, choices, pose)
         for note in imported.notes:
             click.echo(f"note: {note}", err=True)

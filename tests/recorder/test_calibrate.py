@@ -15,6 +15,8 @@ from click.testing import CliRunner, Result
 from calibration.lens import second_from_first
 from calibration.model import Calibration, load_calibration, validate
 from recorder.cli import main
+from recorder.recording.manifest import write_manifest
+from recorder.recording.writer import new_manifest
 from simulated_devices.ideal import write_ideal
 
 Rigtape = Callable[..., Result]
@@ -159,7 +161,7 @@ def test_a_board_is_printed(rigtape: Rigtape, tmp_path: Path, name: str) -> None
         (("cameras", "-o", "c.json"), "give a RECORDING, or --live"),
         (("cameras", ".", "--board", "chess", "-o", "c.json"), "is not a board"),
         (("cameras", ".", "--duration", "5", "-o", "c.json"), "goes with --live"),
-        (("import", EEPROM, "--format", "oak", "-o", "c.json"), "not in the device's memory"),
+        (("import", EEPROM, "--format", "oak", "-o", "c.json"), "memory does not tell where the IMU is"),
         (("import", EEPROM, "--format", "oak", "--size", "big", "-o", "c.json"), "write it like 1280x800"),
         (("import", EEPROM, "--format", "oak", "--imu-to-camera", "oak-x", "-o", "c.json"), "neither a file nor one"),
         (("import", EEPROM, "--format", "oak", "--imu-axes", "up,left,back", "-o", "c.json"), "go together"),
@@ -190,7 +192,61 @@ def test_eeprom_with_the_imu_as_designed(rigtape: Rigtape, tmp_path: Path) -> No
         "calibrate", "import", EEPROM, *OAK, "--socket", "CAM_C", "--imu-to-camera", "oak-d-pro-w", "-o", "d.json"
     )
     assert wrong.exit_code == 2
-    assert "is known of CAM_B" in wrong.output
+    assert "is known of CAM_B, camera 0 is CAM_C" in wrong.output
+
+
+@pytest.fixture
+def oak_recording(tmp_path: Path) -> Path:
+    """What a take of an OAK with a colour camera keeps of its lenses."""
+    folder = tmp_path / "take"
+    (folder / "raw").mkdir(parents=True)
+    (folder / "raw" / "oak.eeprom.json").write_bytes(EEPROM.read_bytes())
+    cameras = {"left": ("CAM_B", 640, 480), "right": ("CAM_C", 640, 480), "color": ("CAM_A", 1920, 1080)}
+    for name, (socket, width, height) in cameras.items():
+        matrix = [[width / 1.34, 0, width / 2 + 3], [0, width / 1.34, height / 2 - 2], [0, 0, 1]]
+        lens = {"socket": socket, "imageWidth": width, "imageHeight": height, "intrinsicMatrix": matrix}
+        (folder / "raw" / f"oak.{name}.lens.json").write_text(json.dumps(lens))
+    names = ["front", *(f"oak.{name}" for name in cameras)]
+    manifest = new_manifest(
+        "take", start_monotonic_ns=0, utc_ns=0, utc_source="", cameras=names, devices={}, clocks={}, rig={}
+    )
+    write_manifest(folder, manifest)
+    return folder
+
+
+def test_a_recording_of_an_oak_knows_its_lenses(rigtape: Rigtape, oak_recording: Path, tmp_path: Path) -> None:
+    """Each camera with its own size and the intrinsics that the device reported for these very pictures."""
+    pose = ("--imu-to-camera", "oak-d-pro-w")
+    result = rigtape("calibrate", "import", oak_recording, *OAK, *pose, "-o", "c.json")
+    assert result.exit_code == 0, result.output
+    cameras = load_calibration(tmp_path / "c.json").cameras
+    assert [(camera.image_width_px, camera.image_height_px) for camera in cameras] == [
+        (640, 480), (640, 480), (1920, 1080)
+    ]  # fmt: skip
+    assert cameras[0].focal_length_x_px == pytest.approx(640 / 1.34)
+    assert (cameras[2].principal_point_x_px, cameras[2].principal_point_y_px) == (963, 538)
+    of_left = dict(json.loads(EEPROM.read_text())["cameraData"])[1]
+    assert cameras[0].distortion_coefficients == of_left["distortionCoeff"][:8]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda raw: (raw / "oak.eeprom.json").unlink(), "there is: none"),
+        (lambda raw: (raw / "b.eeprom.json").write_text("{}"), "there is: b.eeprom.json, oak.eeprom.json"),
+        (lambda raw: (raw / "oak.right.lens.json").unlink(), "oak.right.lens.json: cannot be read"),
+        (lambda raw: (raw / "oak.left.lens.json").write_text("[]"), "oak.left.lens.json: must be an object"),
+        (lambda raw: (raw / "oak.left.lens.json").write_text("{}"), "imageWidth, imageHeight: must be a list of"),
+        (lambda raw: (raw.parent / "recording.json").unlink(), "not a recording of rigtape"),
+    ],
+)
+def test_a_recording_of_an_oak_that_lacks_something_is_told(
+    rigtape: Rigtape, oak_recording: Path, spoil: Callable[[Path], object], words: str
+) -> None:
+    spoil(oak_recording / "raw")
+    result = rigtape("calibrate", "import", oak_recording, *OAK, "--imu-to-camera", "identity", "-o", "c.json")
+    assert result.exit_code in (1, 2)
+    assert words in result.output
 
 
 def test_what_is_wrong_is_not_written(rigtape: Rigtape, tmp_path: Path) -> None:
