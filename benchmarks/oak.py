@@ -15,6 +15,7 @@ small pictures, and ten times the limit.
 """
 
 import argparse
+import contextlib
 import json
 import sys
 import tempfile
@@ -75,9 +76,9 @@ class LinkCpu:
     def read(self) -> float:
         for thread in threading.enumerate():
             if thread.name == THREAD_NAME and thread.native_id is not None:
-                path = Path(f"/proc/self/task/{thread.native_id}/schedstat")
-                if path.exists():
-                    self._by_thread[thread.native_id] = int(path.read_text().split()[0]) * 1e-9
+                with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+                    text = Path(f"/proc/self/task/{thread.native_id}/schedstat").read_text()
+                    self._by_thread[thread.native_id] = int(text.split()[0]) * 1e-9
         return sum(self._by_thread.values())
 
 
