@@ -24,6 +24,10 @@ class DeviceError(Exception):
     """A device that cannot be used now: absent, refusing, or gone. The message says what was tried."""
 
 
+class SilentError(DeviceError):
+    """Nothing comes, and all that can be done is to listen: the link stays open, so that no beginning is missed."""
+
+
 class DeviceConfig(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     """Keys that every device in rig.yaml has.
 
@@ -75,7 +79,7 @@ class Driver(Protocol):
         """What the device said of itself (serial number, firmware), empty before it was connected."""
 
     def connect(self) -> None:
-        """Open and configure the device. Raises DeviceError with what was tried."""
+        """Open and configure the device, or go on with a link that was kept. Raises DeviceError with what was tried."""
 
     def read(self, stop: Event) -> Iterator[Received]:
         """Yield what comes until `stop` is set. Raises DeviceError when the device is lost."""
@@ -110,12 +114,18 @@ def driver_type(name: str) -> DriverType:
 
 
 def received(
-    driver: Driver, stop: Event, *, connected: bool, wait: Callable[[float], object] | None = None
+    driver: Driver,
+    stop: Event,
+    *,
+    connected: bool,
+    wait: Callable[[float], object] | None = None,
+    keep_silent: bool = True,
 ) -> Iterator[Received]:
     """Yield what a device sends until `stop` is set, taking it up again whenever it was lost.
 
     It is told as connected with its first data: a port that can be opened but stays silent is no news.
     wait: how to let so many seconds pass before the next attempt (default: until `stop` is set).
+    keep_silent: a link stays open that is merely silent; a capture opens it anew, with what comes next.
     """
     is_present = connected
     told: set[str] = set()  # of one absence: an event for each cause, not for each attempt
@@ -131,13 +141,16 @@ def received(
                         told.clear()
                     yield item
             except DeviceError as error:
-                driver.close()
+                is_kept = keep_silent and isinstance(error, SilentError)
+                if not is_kept:
+                    driver.close()
                 text = str(error)
                 if is_present or (text not in told and len(told) < MAX_CAUSES):
                     told.add(text)
                     yield Received(events=(DeviceEvent("lost" if is_present else "warning", text),))
                 is_present = False
-                (wait or stop.wait)(RETRY_S)
+                if not is_kept:
+                    (wait or stop.wait)(RETRY_S)
     finally:
         driver.close()
 

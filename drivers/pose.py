@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
+from drivers.device import DeviceConfig, DriverType, SilentError, StreamSpec
 from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, UdpPorts
 from drivers.samples import Chunk, DeviceEvent, PoseSample, Received, Sample, Vector
 
@@ -99,20 +99,18 @@ class PoseDriver:
     def connect(self) -> None:
         """Open the port and wait for a first datagram. Raises DeviceError with what to check."""
         config = self._config
-        self.close()
-        self._link = link = self.links.udp(config.address, (config.port,))
+        self._link = link = self._link or self.links.udp(config.address, (config.port,))
         self._decoder = PoseDecoder()
         self._garbage = GarbageWatch(self._decoder)
         self._last_sequence: int | None = None
-        self._kernel_drops = self._foreign = 0
+        self._kernel_drops, self._foreign = link.kernel_drops, link.foreign
         self._last_foreign_ns = -FOREIGN_QUIET_NS
         deadline_ns = self.links.monotonic_ns() + int(FIRST_POSE_S * 1e9)
         self._held: Sequence[Chunk] = []
         while not self._held and (left_ns := deadline_ns - self.links.monotonic_ns()) > 0:
             self._held = link.read(left_ns / 1e9)
         if not self._held:
-            self.close()
-            raise DeviceError(
+            raise SilentError(
                 f"no pose from {config.address} on UDP port {config.port} within {FIRST_POSE_S:.0f} s; its destination "
                 "address must be this host's, and no firewall may stand between; "
                 f"{link.foreign} datagrams came from other addresses"
@@ -132,7 +130,7 @@ class PoseDriver:
             if chunks:
                 last_chunk_ns = now_ns
             elif now_ns - last_chunk_ns > SILENCE_S * 1e9:
-                raise DeviceError(f"{self._config.address}: no pose for {SILENCE_S:.0f} s")
+                raise SilentError(f"{self._config.address}: no pose for {SILENCE_S:.0f} s")
             chunks = link.read(0.1)
 
     def _take(self, link: UdpPorts, chunks: Sequence[Chunk], now_ns: int) -> Received:

@@ -15,7 +15,7 @@ from typing import Annotated, Generic, Protocol, TypeVar
 
 from msgspec import Meta
 
-from drivers.device import DeviceConfig, DeviceError, StreamSpec
+from drivers.device import DeviceConfig, DeviceError, SilentError, StreamSpec
 from drivers.links import LIVE, SILENCE_S, CountsBadInput, GarbageWatch, Links, SerialPort
 from drivers.recognise import describe
 from drivers.samples import Chunk, DeviceEvent, ImuSample, Received, Sample
@@ -160,7 +160,8 @@ class Care:
     """Watches a running device: bytes without frames, garbage, and when it has gone silent.
 
     frames: how many were understood; message: what one is called. cut_bytes: the port may be opened so far inside of
-    a frame. watches: what else to look after, asked at each read with its arrival.
+    a frame. watches: what else to look after, asked at each read with its arrival. only_listens: a device that is
+    silent has nothing to be told, and its port stays open.
     """
 
     decoder: CountsBadInput
@@ -171,6 +172,7 @@ class Care:
     silence_s: float = SILENCE_S
     watches: Sequence[Watch] = ()
     is_serial: bool = True
+    only_listens: bool = True
     _garbage: GarbageWatch | None = None
     _heard_ns: int | None = None
     _framed_ns: int = 0
@@ -185,7 +187,8 @@ class Care:
         if data:
             self._heard_ns = arrival_ns
         elif arrival_ns - self._heard_ns > self.silence_s * 1e9:
-            raise DeviceError(f"{self.where}: no data for {self.silence_s:g} s")
+            silence = SilentError if self.only_listens else DeviceError
+            raise silence(f"{self.where}: no data for {self.silence_s:g} s")
         frames = self.frames()
         told: tuple[DeviceEvent, ...] = ()
         if frames != self._frames:
@@ -305,6 +308,7 @@ class SerialDriver(ABC, Generic[Decoder]):
         self._rate_hz = rate_hz
         self._identity: dict[str, str] = {}
         self._link: SerialPort | None = None
+        self._is_read = False
         self._begun = Received()
         self._early: list[tuple[int, Sample]] = []
         self._renew()
@@ -330,6 +334,10 @@ class SerialDriver(ABC, Generic[Decoder]):
         """Port and baud rate, for messages."""
         return f"{self._serial.port} at {self._serial.baud} baud"
 
+    @property
+    def _only_listens(self) -> bool:
+        return not getattr(self._serial, "configure", False)
+
     @abstractmethod
     def _sample_bytes(self) -> float:
         """Bytes of a sample on the wire."""
@@ -347,7 +355,8 @@ class SerialDriver(ABC, Generic[Decoder]):
 
     def _begin(self, link: SerialPort) -> tuple[Chunk, ...]:
         """Let the device measure, or where it does so already throw away what waits: its arrival is not known."""
-        link.discard_input()
+        if not self._is_read:
+            link.discard_input()
         return ()
 
     def _watches(self) -> Sequence[Watch]:
@@ -389,9 +398,11 @@ class SerialDriver(ABC, Generic[Decoder]):
     def connect(self) -> None:
         """Open the port and configure the device. Raises DeviceError with what was tried."""
         self._check()
-        self.close()
         self._renew()
         self._begun = Received()
+        if self._link is not None and self._only_listens:
+            return
+        self.close()
         self._link = self.links.serial(self._serial.port, self._serial.baud, keep_dtr=self._serial.keep_dtr)
         try:
             self._begun = self._configure(self._link)
@@ -408,11 +419,15 @@ class SerialDriver(ABC, Generic[Decoder]):
         self._renew()  # what came up to here was the measurement that we broke off
         self._arrivals.byte_time_ns = link.byte_time_ns
         chunks = self._begin(link)
+        self._is_read = True
         yield Received(chunks, tuple(self._early))
         decoder, rate = self._decoder, RateWatch(self._rate_hz, self.where)
         rate.is_over = self.links is not LIVE  # a capture may be played at any rate
         watches: tuple[Watch, ...] = (GapWatch(decoder, self.lost_by), rate, *self._watches())
-        care = Care(decoder, lambda: decoder.frames, self.message, self.where, self.cut_bytes, watches=watches)
+        care = Care(
+            decoder, lambda: decoder.frames, self.message, self.where, self.cut_bytes,
+            watches=watches, only_listens=self._only_listens,
+        )  # fmt: skip
         while not stop.is_set():
             arrival_ns, data = link.read(READ_S)
             samples = self._stamped(arrival_ns, data)
@@ -430,3 +445,4 @@ class SerialDriver(ABC, Generic[Decoder]):
         if self._link is not None:
             self._link.close()
             self._link = None
+            self._is_read = False

@@ -188,7 +188,7 @@ class _Decoding:
         """Read the capture to its end."""
         stopped_by = "interrupt"
         try:
-            for item in received(self._driver, stop, connected=False, wait=lambda _: None):
+            for item in received(self._driver, stop, connected=False, wait=lambda _: None, keep_silent=False):
                 self._take(item)
                 if self._failures or self._is_disk_low():
                     stopped_by = f"error: {self._failures[0]}" if self._failures else "disk low"

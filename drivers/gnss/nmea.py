@@ -68,6 +68,7 @@ class NmeaDriver:
         self._config = config
         self._where = f"{config.port} at {config.baud} baud" if config.port else config.tcp or f"UDP {config.udp}"
         self._link: SerialPort | None = None
+        self._is_read = False
         self.streams = (StreamSpec("gnss", config.rate_hz, config.rate_hz * FIX_BYTES),)
 
     @property
@@ -77,7 +78,8 @@ class NmeaDriver:
 
     def connect(self) -> None:
         """Open the link. Raises DeviceError when that fails."""
-        self.close()
+        if self._link is not None:
+            return
         config = self._config
         if config.port:
             self._link = self.links.serial(config.port, config.baud, keep_dtr=config.keep_dtr)
@@ -91,7 +93,9 @@ class NmeaDriver:
             raise DeviceError(f"{self._where}: not connected")
         period_s = 1 / self._config.rate_hz
         idle_s = max(MIN_IDLE_S, IDLE_SHARE * period_s)
-        link.discard_input()  # the arrival of what waits is not known
+        if not self._is_read:
+            link.discard_input()  # the arrival of what waits is not known
+        self._is_read = True
         decoder = NmeaDecoder(self.links.utc_ns(), rules=self._rules())
         arrivals = Arrivals(link.byte_time_ns)
         watch = _Watch(decoder, self._where, self._config, has_baud_rate=link.byte_time_ns > 0)
@@ -104,6 +108,7 @@ class NmeaDriver:
             max(SILENCE_S, SILENT_PERIODS * period_s),
             (watch,),
             is_serial=bool(self._config.port),
+            only_listens=not self._config.tcp,  # a connection may be dead
         )
         if link.events:
             yield Received(events=link.events)
@@ -135,6 +140,7 @@ class NmeaDriver:
         if self._link is not None:
             self._link.close()
             self._link = None
+            self._is_read = False
 
 
 DRIVER = DriverType(config=NmeaConfig, create=NmeaDriver)

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
+from drivers.device import DeviceConfig, DeviceError, DriverType, SilentError, StreamSpec
 from drivers.lidar import fast
 from drivers.lidar.difop import destination, helios_lasers, is_difop
 from drivers.lidar.models import HELIOS, M1, MODELS, Model, ModelKey, SequencedModel, SpinningModel, recognise
@@ -112,14 +112,12 @@ class RobosenseDriver:
 
     def connect(self) -> None:
         """Open the ports and wait for the first measurement packet. Raises DeviceError with what to check."""
-        self.close()
-        self._link = link = self._open()
+        if self._config.multicast_group:
+            self.close()  # the membership may have ended with its interface
+        self._link = link = self._link or self._open()
+        link.kernel_drops = link.foreign = 0
         self._held, self._unsent_pairs = [], []
-        try:
-            model, difop, self._connect_events = self._meet(link)
-        except DeviceError:
-            self.close()
-            raise
+        model, difop, self._connect_events = self._meet(link)
         if isinstance(model, SequencedModel):
             fast.warm_up(model)
         self._decoder = decoder = RobosenseDecoder(model, self._options)
@@ -139,7 +137,7 @@ class RobosenseDriver:
         config = self._config
         first = self._wait_for(link, lambda data: recognise(data) is not None, FIRST_PACKET_S)
         if first is None:
-            raise DeviceError(self._no_packet(link))
+            raise SilentError(self._no_packet(link))
         data = self._packet(first)
         found = recognise(data)
         assert found is not None
@@ -230,7 +228,7 @@ class RobosenseDriver:
             events=self._losses.events(self.links.monotonic_ns()),
         )
         if not stop.is_set():
-            raise DeviceError(f"{self._config.address}: no measurement packet for {SILENCE_S:.0f} s")
+            raise SilentError(f"{self._config.address}: no measurement packet for {SILENCE_S:.0f} s")
 
     def _backlog(self, link: UdpPorts) -> Iterator[Received]:
         """What came between connecting and now; nothing if the socket's buffer overflowed while nobody read it."""

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
+from drivers.device import DeviceConfig, DriverType, SilentError, StreamSpec
 from drivers.lidar.imu import ImuDecoder
 from drivers.lidar.robosense import Ipv4Address, Ipv4OrNone
 from drivers.links import LIVE, SILENCE_S, GarbageWatch, Links, UdpOptions, UdpPorts
@@ -64,9 +64,10 @@ class RobosenseImuDriver:
     def connect(self) -> None:
         """Open the port and wait for the first reading. Raises DeviceError with what to check."""
         config = self._config
-        self.close()
+        if config.multicast_group:
+            self.close()  # the membership may have ended with its interface
         options = UdpOptions(multicast_group=config.multicast_group, interface=config.interface, shared=True)
-        self._link = link = self.links.udp(config.address, (self._port,), options)
+        self._link = link = self._link or self.links.udp(config.address, (self._port,), options)
         self._decoder = ImuDecoder(config.model)
         self._garbage = GarbageWatch(self._decoder)
         self._lost = 0
@@ -77,8 +78,7 @@ class RobosenseImuDriver:
             left_ns = deadline_ns - self.links.monotonic_ns()
             if left_ns <= 0:
                 count = probe.bad_frames
-                self.close()
-                raise DeviceError(
+                raise SilentError(
                     f"no IMU reading from {config.address} on UDP port {self._port} within {FIRST_PACKET_S:.0f} s; "
                     f"{count} datagrams of other kinds came; {link.foreign} came from other addresses"
                 )
@@ -98,7 +98,7 @@ class RobosenseImuDriver:
             if received.samples:
                 last_sample_ns = now_ns
             elif now_ns - last_sample_ns > SILENCE_S * 1e9:
-                raise DeviceError(f"{self._config.address}: no IMU reading for {SILENCE_S:.0f} s")
+                raise SilentError(f"{self._config.address}: no IMU reading for {SILENCE_S:.0f} s")
             chunks = link.read(0.1)
 
     def _take(self, chunks: Sequence[Chunk], now_ns: int) -> Received:

@@ -8,12 +8,12 @@ from threading import Event, Thread
 import pytest
 
 from drivers import device
-from drivers.device import DeviceError, driver_names, driver_type, received
+from drivers.device import DeviceError, SilentError, driver_names, driver_type, received
 from drivers.samples import Chunk, DeviceEvent, Received
 
 ABSENT = DeviceError("/dev/imu: cannot open")
 GONE = DeviceError("/dev/imu: device is gone")
-SILENT = DeviceError("/dev/imu: no data for 3 s")
+SILENT = SilentError("/dev/imu: no data for 3 s")
 STOP = "stop"
 
 Action = Received | DeviceError | str
@@ -142,6 +142,12 @@ def test_each_absence_is_told(run: Run) -> None:
 def test_port_that_opens_but_stays_silent_is_told_once(run: Run) -> None:
     items, _ = run(*[[Received(), SILENT]] * 20, [STOP], connected=True)
     assert events(items) == [("lost", str(SILENT))]
+
+
+def test_a_link_that_was_only_silent_stays_open(run: Run) -> None:
+    items, driver = run([data(1), SILENT], [data(2), STOP], connected=True)
+    assert events(items) == [CONNECTED, ("lost", str(SILENT)), CONNECTED]
+    assert driver.calls == ["read", "connect", "read", "close"]
 
 
 def test_ever_new_causes_do_not_fill_the_log(run: Run) -> None:

@@ -213,8 +213,10 @@ def test_kernel_drops_are_told(network: Network, monkeypatch: pytest.MonkeyPatch
 
 def test_nobody_there(network: Network) -> None:
     network.at_connect = lambda: network.send(message(), source=STRANGER)
+    driver = network.driver()
     with pytest.raises(DeviceError, match=rf"no pose from {SENDER} on UDP port {network.port}.* 1 datagrams"):
-        network.driver().connect()
+        driver.connect()
+    driver.close()
 
 
 def test_silence_is_an_error_and_the_source_can_come_back(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,9 +228,10 @@ def test_silence_is_an_error_and_the_source_can_come_back(network: Network, monk
     with pytest.raises(DeviceError, match="no pose for"):
         items.extend(driver.read(Event()))
     assert poses_of(items) == [3]
-    driver.close()
+    network.at_connect = lambda: None
+    network.send(message(4))  # while nobody reads
     driver.connect()
-    assert poses_of(collect(driver.read(Event()), lambda items: chunk_count(items) == 1)) == [3]
+    assert poses_of(collect(driver.read(Event()), lambda items: chunk_count(items) == 1)) == [4]
     driver.close()
     driver.close()
 

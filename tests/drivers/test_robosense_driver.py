@@ -237,20 +237,26 @@ def test_two_lidars_on_one_port_are_told_once(network: Network) -> None:
 
 def test_nobody_there(network: Network) -> None:
     network.at_connect = lambda: network.send(*frame(0, 40)[:7], source=STRANGER)
+    driver = network.driver()
     with pytest.raises(DeviceError, match=rf"no packet from {LIDAR} on UDP port {network.msop_port}.* 7 datagrams"):
-        network.driver().connect()
+        driver.connect()
+    driver.close()
 
 
 def test_lidar_that_sends_elsewhere_says_where(network: Network) -> None:
     network.at_connect = lambda: network.send(difop(), to_difop=True)
+    driver = network.driver()
     with pytest.raises(DeviceError, match=r"sends to 192\.168\.1\.102 port 6699"):
-        network.driver().connect()
+        driver.connect()
+    driver.close()
 
 
 def test_another_model_is_not_taken_for_an_m1(network: Network) -> None:
     network.at_connect = lambda: network.send(bytes(1248))
+    driver = network.driver()
     with pytest.raises(DeviceError, match=r"1 datagrams came, of 1248 bytes, none is of a known model"):
-        network.driver().connect()
+        driver.connect()
+    driver.close()
 
 
 def test_silence_gives_the_last_frame_then_the_error(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,12 +267,13 @@ def test_silence_gives_the_last_frame_then_the_error(network: Network, monkeypat
     items = []
     with pytest.raises(DeviceError, match="no measurement packet"):
         items.extend(driver.read(Event()))
-    driver.close()
     pairs = [sample for item in items for _, sample in item.samples if isinstance(sample, ClockPairs)]
     assert sum(pair.ticks.size for pair in pairs) == 20
     assert [scan.packets_received for scan in scans_of(items)] == [20]
-    network.at_connect = lambda: network.send(*frame(9, 40))
+    network.at_connect = lambda: None
+    network.send(*frame(9, 40))  # while nobody reads
     driver.connect()  # and it is taken up again
+    assert next(item for item in driver.read(Event()) if item.chunks).chunks[0].data == frame(9, 40)[0]
     driver.close()
     driver.close()
 

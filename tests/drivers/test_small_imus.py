@@ -4,19 +4,22 @@ import math
 from functools import reduce
 from itertools import pairwise
 from operator import xor
+from threading import Event
 
 import msgspec
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.device import DeviceError
+from drivers import links
+from drivers.device import DeviceError, SilentError
 from drivers.imu import ascii_imu, rvc, witmotion
 from drivers.imu.ascii_decoder import MAX_LINE_BYTES, AsciiDecoder, LineFormat
 from drivers.imu.ascii_imu import AsciiConfig, line_format
 from drivers.imu.rvc_decoder import RvcDecoder
 from drivers.imu.witmotion_decoder import WitmotionDecoder
 from drivers.samples import ImuSample
+from tests.drivers.conftest import ScriptedLink
 
 WIT_ACCEL = bytes.fromhex("5551000400FC00084E0C08")
 WIT_GYRO = bytes.fromhex("5552A400B8FE10004E0C6B")
@@ -141,6 +144,29 @@ def test_rvc_over_a_pty(pty_device, read_until) -> None:
     received = read_until(driver, samples=2, events=1, then=lambda: device.send(rvc_frame(7) + rvc_frame(9)))
     assert [sample.device_ticks for part in received for _, sample in part.samples] == [7, 9]
     assert [(event.kind, event.count) for part in received for event in part.events] == [("gap", 1)]
+    driver.close()
+
+
+def test_a_silent_port_stays_open_and_its_first_bytes_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Port(ScriptedLink):
+        discarded = closed = 0
+
+        def discard_input(self) -> None:
+            self.discarded += 1
+
+        def close(self) -> None:
+            self.closed += 1
+
+    port = Port([(1.0, b""), (4.1, b""), (4.2, rvc_frame(7))], 0.0)
+    monkeypatch.setattr(links, "SerialLink", lambda name, baud, keep_dtr: port)
+    driver = rvc.DRIVER.create("imu", rvc.RvcConfig(driver="bno08x-rvc", port="/dev/imu"))
+    driver.connect()
+    with pytest.raises(SilentError, match="/dev/imu at 115200 baud: no data for 3 s"):
+        list(driver.read(Event()))
+    driver.connect()
+    samples = (sample for part in driver.read(Event()) for _, sample in part.samples)
+    assert next(samples).device_ticks == 7
+    assert (port.discarded, port.closed) == (1, 0)
     driver.close()
 
 
