@@ -55,10 +55,9 @@ LINE_BAUD = 4_000_000
 LINE_COLUMNS = ["time", "ax", "ay", "az", "gx", "gy", "gz"]
 POSE_PORT = 5005
 MICROSECOND_NS = 1000
-# Nothing can be sent again, so whoever opened the devices must have stopped to wait for the silent ones (5 s for a
-# picture, 3 s for a datagram, not at all for a serial line), and read; but not yet for 3 s, for then it closes a port
-# that is silent and opens it anew.
-SETTLE_NS = {PictureReplay: 6 * SECOND_NS, DatagramReplay: 4 * SECOND_NS, SerialReplay: 0}
+# Nothing can be sent again, so whoever opened the devices must have stopped to wait for the silent ones: 5 s where it
+# wants a picture, 3 s for a datagram. It does not wait for a serial line, but throws away what came before it reads.
+SETTLE_NS = {PictureReplay: 5 * SECOND_NS, DatagramReplay: 3 * SECOND_NS, SerialReplay: SECOND_NS // 2}
 
 
 def replay(folder: Path, speed: float, *, report: bool = False) -> Simulation:

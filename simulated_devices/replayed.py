@@ -29,7 +29,6 @@ PictureScript = Iterable[tuple[int, int, Any]]
 """Due, time stamp in microseconds, packet."""
 
 _WAITING_S = 0.02
-_HESITATES_NS = (SECOND_NS, 4 * SECOND_NS)  # a recorder gives up a silent port about then, and tries again
 _UDP_TABLE = Path("/proc/net/udp")
 _CLIENT_STUCK_S = 1.0
 
@@ -77,15 +76,14 @@ class SerialReplay:
     def run(self) -> None:
         """Play the script once. What is written to the device is read and not followed."""
         while not self._performance.has_begun:
-            if self._pty.is_open():
-                self.opened.set()
+            self.opened.set(self._pty.is_open())
             self._listen_until(time.monotonic_ns() + 20 * MILLISECOND_NS)
         for due_ns, data in self._script():
             host_ns = self._performance.host_ns(due_ns)
             self._listen_until(host_ns)
             self._pty.send(data)
             self._pacer.done(host_ns)
-        self._listen_until(time.monotonic_ns() + SECOND_NS // 2)  # a hang-up would take away what was not read yet
+        self._listen_until(time.monotonic_ns() + SECOND_NS)  # a hang-up would take away what was not read yet
 
     def _listen_until(self, host_ns: int) -> None:
         while time.monotonic_ns() < host_ns:
@@ -129,7 +127,7 @@ class DatagramReplay:
 
     def run(self) -> None:
         """Play the script once, when somebody listens."""
-        self._wait_for_a_listener()
+        self._wait_for_the_start()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             try:
                 sender.bind(self._source)
@@ -141,13 +139,10 @@ class DatagramReplay:
                 sender.sendto(data, (HOST, port))
                 self._pacer.done(host_ns)
 
-    def _wait_for_a_listener(self) -> None:
-        """Until the start; whoever has just begun to listen, or listens for good, will be there then."""
-        bound_ns: int | None = None
+    def _wait_for_the_start(self) -> None:
+        """Until the start."""
         while not self._performance.has_begun:
-            now_ns = time.monotonic_ns()
-            bound_ns = (bound_ns or now_ns) if any(map(_is_bound, self._ports)) else None
-            self.opened.set(bound_ns is not None and not _HESITATES_NS[0] < now_ns - bound_ns < _HESITATES_NS[1])
+            self.opened.set(any(map(_is_bound, self._ports)))
             time.sleep(_WAITING_S)
 
 
@@ -195,6 +190,7 @@ class PictureReplay:
                 client.settimeout(_CLIENT_STUCK_S)
                 self.opened.set()
                 self._serve(client, waiting, pictures)
+                self.opened.set(False)
 
     def _serve(self, client: socket.socket, waiting: deque[Any], pictures: Iterator[Any]) -> None:
         """Send pictures as long as the client is there; the one that waits is taken when it is due."""

@@ -27,6 +27,7 @@ from simulated_devices.timing import SECOND_NS, Opened, Stage, die_with_parent, 
 log = logging.getLogger(__name__)
 
 OPENING_NS = 5 * SECOND_NS
+_JUST_NOW_NS = SECOND_NS
 _EXIT_S = 0.5
 _ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
@@ -124,7 +125,8 @@ class Simulation:
     ) -> None:
         """source: the rig, with an entry for each device. report: each says at its end what it sent and how timely.
 
-        settle_ns: at least so long after the first device was opened the world starts.
+        settle_ns: so long whoever records waits for devices that are still silent; then it opens those anew, and reads.
+        The world starts no earlier, and when that has just been done.
         """
         self._devices = devices
         self._source = source
@@ -133,6 +135,7 @@ class Simulation:
         self._calibration = calibration
         self._settle_ns = settle_ns
         self._report = report
+        self._first_opened_ns: int | None = None
         self._processes: dict[str, BaseProcess] = {}
 
     def __enter__(self) -> Simulation:
@@ -155,7 +158,6 @@ class Simulation:
 
         Raises DeviceDiedError when one fails.
         """
-        first_opened_ns: int | None = None
         while os.getppid() == parent:
             moving = self._stage.start_ns != 0
             running = [process.sentinel for process in self._processes.values() if process.exitcode is None]
@@ -165,15 +167,23 @@ class Simulation:
             dead = [name for name, process in self._processes.items() if process.exitcode]
             if dead:
                 raise DeviceDiedError(f"simulated device {', '.join(dead)} ended by itself")
-            if moving:
-                continue
-            opened = [bool(device.opened) for device in self._devices if device.opened is not None]
-            if any(opened) and first_opened_ns is None:
-                first_opened_ns = time.monotonic_ns()
-            now_ns = time.monotonic_ns()
-            waited_ns = now_ns - (first_opened_ns or now_ns) - self._settle_ns
-            if waited_ns >= 0 and (all(opened) or waited_ns > OPENING_NS):
+            if not moving and self._may_start():
                 self._stage.start()
+
+    def _may_start(self) -> bool:
+        """Whether all devices are open and read, or there has been time enough to open them."""
+        now_ns = time.monotonic_ns()
+        since_ns = [device.opened.since_ns for device in self._devices if device.opened is not None]
+        if self._first_opened_ns is None and any(since_ns):
+            self._first_opened_ns = now_ns
+        waited_ns = now_ns - (self._first_opened_ns or now_ns) - self._settle_ns
+        if waited_ns < 0 or not all(since_ns):
+            return waited_ns > OPENING_NS
+        # The last one was opened when the recorder began to read, or by a program that keeps it open. In between it may
+        # be about to be given up for its silence.
+        open_ns = now_ns - max(since_ns, default=now_ns)
+        is_read = open_ns < _JUST_NOW_NS or open_ns > self._settle_ns + _JUST_NOW_NS
+        return is_read or not self._settle_ns or waited_ns > OPENING_NS
 
     def _open(self) -> dict[str, Any]:
         for change in self._ports.changes:

@@ -378,14 +378,20 @@ class Opened:
     """A flag in shared memory: whoever records the device has opened it."""
 
     def __init__(self) -> None:
-        self._flag: c_int64 = RawValue(c_int64, 0)
+        self._since_ns: c_int64 = RawValue(c_int64, 0)
 
     def __bool__(self) -> bool:
-        return bool(self._flag.value)
+        return bool(self._since_ns.value)
+
+    @property
+    def since_ns(self) -> int:
+        """Host time at which the flag was raised, 0 while it is down."""
+        return self._since_ns.value
 
     def set(self, is_open: bool = True) -> None:
         """Raise the flag, or lower it."""
-        self._flag.value = is_open
+        if is_open != bool(self):
+            self._since_ns.value = time.monotonic_ns() if is_open else 0
 
 
 def die_with_parent(signal_number: int = signal.SIGTERM) -> None:

@@ -48,15 +48,32 @@ def shift_ns(before: Any, after: Any, values: str) -> int:
     return int(np.median(shifts))
 
 
+def is_starved(recording: Recording) -> bool:
+    """Whether a device could not be read in time."""
+    assert recording.manifest is not None
+    streams = [device.stream for device in recording.manifest.devices.values()]
+    return any(stream.late + stream.dropped + stream.lost for stream in streams)
+
+
 def place_bytes(points: Any) -> bytes:
     """All of the points but their times."""
     return b"".join(points[axis].tobytes() for axis in ("x", "y", "z", "intensity", "ring"))
 
 
+def pictures(recording: Recording, camera: int) -> tuple[Any, list[bytes]]:
+    """Times and pixels of all pictures of one camera."""
+    taken = [
+        (index, images[camera].tobytes()) for index, images in recording.frames.images() if images[camera] is not None
+    ]
+    return recording.frames.time_ns[[index for index, _ in taken]], [pixels for _, pixels in taken]
+
+
 @pytest.fixture(scope="module")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("take")
-    options = ["--simulate", "--duration", "3", "-o", str(out), "--name", "first", "--set", "simulate.trajectory=brisk"]
+    options = ["--simulate", "--duration", "3", "-o", str(out), "--name", "first", "--set=simulate.trajectory=brisk"]
+    small = {"width": 320, "height": 200, "fps": 10}  # a busy machine shall not lose pictures already here
+    options += [f"--set=devices.{name}.{key}={value}" for name in ("left", "right") for key, value in small.items()]
     subprocess.run([*RIGTAPE, "record", *options], check=True, timeout=40, capture_output=True)
     return out / "first"
 
@@ -67,17 +84,16 @@ def test_the_raw_tape_gives_the_same_samples_again(take: Path, tmp_path: Path) -
         shift = shift_ns(before.sensor(kind), after.sensor(kind), "values")
     assert abs(shift_ns(before.fixes, after.fixes, "geodetic") - shift) < 4 * MOST_LATE_NS
     assert abs(shift_ns(before.poses["groundTruth"], after.poses["groundTruth"], "position_m") - shift) < MOST_LATE_NS
+    if is_starved(before) or is_starved(after):
+        pytest.skip("the machine is too busy for lidar and cameras: what they sent came late")
     scans = [[part.scans.points(index) for index in range(len(part.scans))] for part in (before, after)]
     known = [place_bytes(points) for points in scans[1]]
     assert all(place_bytes(points) in known for points in scans[0])
-    pictures = [[images for _, images in part.frames.images()] for part in (before, after)]
-    known = [b"".join(image.tobytes() for image in images if image is not None) for images in pictures[1]]
-    begin = known.index(b"".join(image.tobytes() for image in pictures[0][0]))
-    for index, images in enumerate(pictures[0]):
-        assert known[begin + index] == b"".join(image.tobytes() for image in images), index
-    assert np.abs(after.frames.time_ns[begin : begin + len(before.frames)] - before.frames.time_ns - shift).max() < (
-        MOST_LATE_NS
-    )
+    for camera in (0, 1):
+        (first_ns, first), (again_ns, again) = (pictures(part, camera) for part in (before, after))
+        begin = again.index(first[0])
+        assert again[begin : begin + len(first)] == first
+        assert np.abs(again_ns[begin : begin + len(first)] - first_ns - shift).max() < MOST_LATE_NS
 
 
 def test_what_has_no_tape_is_sent_in_protocols_that_carry_it(tmp_path: Path) -> None:
