@@ -39,6 +39,7 @@ DISK_EVERY_NS = 1_000_000_000
 DEFAULT_BAUD = 115200
 PORT_KEYS = frozenset(("port", "msop_port", "difop_port", "imu_port"))
 MAX_EARLY_EVENTS = 100
+MAX_FILES = 10
 
 OnProgress = Callable[[Capture], None]
 OnEvent = Callable[[str, DeviceEvent], None]
@@ -175,6 +176,7 @@ class _Decoding:
         self._summary = StreamSummary(stream.kind, stream.rate_hz)
         self._failures: list[str] = []
         self._early_events: list[DeviceEvent] = []
+        self._files: list[tuple[str, bytes]] = []
         self._last_refusal = ""
         self._device_time: _DeviceTime | None = None
         self._is_device_time_known = links.capture.has_arrivals
@@ -219,6 +221,7 @@ class _Decoding:
             self._now_ns = self._links.monotonic_ns()
         for event in item.events:
             self._note(event)
+        self._files += item.files[: MAX_FILES - len(self._files)]
         if self._pipeline is None:
             return
         for arrival_ns, sample in samples:
@@ -346,6 +349,8 @@ class _Decoding:
         if self._writer is None or self._pipeline is None:
             return None
         self._pipeline.finish()
+        for name, data in self._files:
+            self._writer.raw.put_file(self._device.name, name, data)
         manifest = self._writer.manifest
         manifest.clocks = self._pipeline.clock_summaries()
         faults = self._writer.close(self._last_ns - manifest.start_monotonic_ns, stopped_by)

@@ -1,9 +1,10 @@
 """Information packets (DIFOP): who the lidar is, how it is set up, and its calibration.
 
 What is known of their layout differs between the vendor's driver and its manuals. Only fields both agree on, or which
-were seen on real sensors, are told as facts; the packet itself is on the raw tape.
+were seen on real sensors, are told as facts; the packet itself is kept beside them.
 """
 
+import json
 import struct
 from dataclasses import dataclass, field, replace
 
@@ -57,6 +58,16 @@ class LidarFacts:
             "difop_uncertain": self.uncertain,
         }
         return {key: text for key, text in facts.items() if text.strip("0:")}
+
+
+def describe(difop: bytes, facts: LidarFacts) -> bytes:
+    """What a recording keeps of it, as JSON: the facts, the calibration they hold (each laser), and the packet."""
+    told: dict[str, object] = dict(facts.identity())
+    if facts.setup is not None:
+        told["vertical_deg"] = (facts.setup.vertical / 100).tolist()
+        told["horizontal_deg"] = (facts.setup.horizontal / 100).tolist()
+        told["install_mode"] = facts.setup.install_mode
+    return json.dumps(told | {"packet": difop.hex()}, indent=1).encode()
 
 
 def is_difop(datagram: bytes) -> bool:

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, SilentError, StreamSpec
 from drivers.lidar import fast
-from drivers.lidar.difop import destination, helios_lasers, is_difop
+from drivers.lidar.difop import describe, destination, helios_lasers, is_difop
 from drivers.lidar.models import HELIOS, M1, MODELS, Model, ModelKey, SequencedModel, SpinningModel, recognise
 from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
 from drivers.lidar.slots import DUAL_RETURN, NO_TICKS
@@ -123,6 +123,7 @@ class RobosenseDriver:
         self._decoder = decoder = RobosenseDecoder(model, self._options)
         self._bad_packets, self._losses = BadPacketWatch(decoder), LossWatch(decoder, link)
         self._setup_changes = SetupWatch(decoder)
+        self._is_told = False
         if difop is not None:
             decoder.feed(difop)
 
@@ -223,10 +224,9 @@ class RobosenseDriver:
             if 0 < len(chunks) < BATCH_DATAGRAMS:
                 self.links.sleep(self._collect_s)
         last_scans = [(self._last_arrival_ns, scan) for scan in self._decoder.finish()]
-        yield Received(
-            samples=(*self._pairs(), *last_scans),
-            events=self._losses.events(self.links.monotonic_ns()),
-        )
+        now_ns = self.links.monotonic_ns()
+        events = self._losses.events(now_ns, is_last=True) + self._bad_packets.events(now_ns, is_last=True)
+        yield Received(samples=(*self._pairs(), *last_scans), events=events)
         if not stop.is_set():
             raise SilentError(f"{self._config.address}: no measurement packet for {SILENCE_S:.0f} s")
 
@@ -253,7 +253,14 @@ class RobosenseDriver:
                 samples += self._pairs()
         samples += scans
         events = self._losses.events(now_ns) + self._bad_packets.events(now_ns) + self._setup_changes.events()
-        return Received(chunks, tuple(samples), events)
+        return Received(chunks, tuple(samples), events, files=self._files())
+
+    def _files(self) -> tuple[tuple[str, bytes], ...]:
+        """What the lidar told of itself, once."""
+        if self._is_told or not self._decoder.difop:
+            return ()
+        self._is_told = True
+        return (("difop.json", describe(self._decoder.difop, self._decoder.facts)),)
 
     def _decode(self, chunks: Sequence[Chunk]) -> tuple[list[tuple[int, ScanSample]], ClockPairs]:
         """Frames with the arrival of the packet that closed them, and the clock pairs of all measurement packets."""

@@ -1,4 +1,4 @@
-"""Turns what decoder and link count into events: once per burst, with numbers that add up."""
+"""Turns what decoder and link count into events: few of them, with numbers that add up."""
 
 from dataclasses import dataclass, field
 
@@ -6,7 +6,7 @@ from drivers.lidar.robosense_decoder import RobosenseDecoder
 from drivers.links import GarbageWatch, UdpPorts
 from drivers.samples import DeviceEvent
 
-BURST_QUIET_NS = 10_000_000_000
+TELL_EVERY_NS = 10_000_000_000
 KINDS = {
     "length": "of wrong length",
     "magic": "that are no lidar's",
@@ -20,15 +20,20 @@ KINDS = {
 }
 
 
-class Burst:
-    """Things that come in bursts and are told once for each."""
+class Sparsely:
+    """A count that is told when it begins to grow, then every ten seconds while it does."""
 
-    _last_ns = -BURST_QUIET_NS
+    def __init__(self) -> None:
+        self._told = 0
+        self._last_ns = -TELL_EVERY_NS
 
-    def begins(self, now_ns: int) -> bool:
-        """Whether what happens now is the first of a burst: nothing of it had come for a while."""
-        quiet_ns, self._last_ns = now_ns - self._last_ns, now_ns
-        return quiet_ns >= BURST_QUIET_NS
+    def news(self, total: int, now_ns: int, is_last: bool) -> int:
+        """How many are to be told of now. is_last: all that are left."""
+        new = total - self._told
+        if not new or not (is_last or now_ns - self._last_ns >= TELL_EVERY_NS):
+            return 0
+        self._told, self._last_ns = total, now_ns
+        return new
 
 
 class LossWatch:
@@ -41,17 +46,16 @@ class LossWatch:
     def __init__(self, decoder: RobosenseDecoder, link: UdpPorts) -> None:
         self._decoder = decoder
         self._link = link
-        self._lost = self._restarts = self._kernel_drops = self._foreign = 0
-        self._unexplained_drops = 0
-        self._restart_burst, self._foreign_burst = Burst(), Burst()
+        self._lost = self._kernel_drops = self._unexplained_drops = 0
+        self._restarts, self._foreign = Sparsely(), Sparsely()
 
     def forgive_kernel_drops(self) -> int:
         """Forget the drops so far; gives their number."""
         drops, self._kernel_drops = self._link.kernel_drops - self._kernel_drops, self._link.kernel_drops
         return drops
 
-    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
-        """What is new since the last call."""
+    def events(self, now_ns: int, is_last: bool = False) -> tuple[DeviceEvent, ...]:
+        """What is new since the last call. is_last: the reading has ended."""
         events: list[DeviceEvent] = []
         if drops := self.forgive_kernel_drops():
             self._unexplained_drops += drops
@@ -63,16 +67,12 @@ class LossWatch:
             self._unexplained_drops -= explained
             if lost > explained:
                 events.append(DeviceEvent("gap", f"{lost - explained} packets missing in frames", lost - explained))
-        if restarts := self._decoder.restarts - self._restarts:
-            self._restarts += restarts
-            if self._restart_burst.begins(now_ns):
-                text = "the time in the packets jumped, frames start over: its clock was set, or two lidars send here"
-                events.append(DeviceEvent("warning", text, restarts))
-        if foreign := self._link.foreign - self._foreign:
-            self._foreign += foreign
-            if self._foreign_burst.begins(now_ns):
-                text = f"datagrams from other addresses than {self._link.address} are ignored"
-                events.append(DeviceEvent("warning", text, foreign))
+        if restarts := self._restarts.news(self._decoder.restarts, now_ns, is_last):
+            text = "the time in the packets jumped, frames start over: its clock was set, or two lidars send here"
+            events.append(DeviceEvent("warning", text, restarts))
+        if foreign := self._foreign.news(self._link.foreign, now_ns, is_last):
+            text = f"{foreign} datagrams from other addresses than {self._link.address} were ignored"
+            events.append(DeviceEvent("warning", text, foreign))
         return tuple(events)
 
 
@@ -84,9 +84,9 @@ class BadPacketWatch:
         self._garbage = GarbageWatch(decoder)
         self._told: dict[str, int] = {}
 
-    def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
-        """The event of a burst that is over, else nothing."""
-        if not self._garbage.events(now_ns):
+    def events(self, now_ns: int, is_last: bool = False) -> tuple[DeviceEvent, ...]:
+        """The event of a burst that is over, else nothing. is_last: the reading has ended, and with it the burst."""
+        if not self._garbage.events(now_ns) and not (is_last and self._told != self._decoder.bad):
             return ()
         new = {kind: count - self._told.get(kind, 0) for kind, count in self._decoder.bad.items()}
         self._told = dict(self._decoder.bad)

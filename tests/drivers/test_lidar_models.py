@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.lidar import fast
-from drivers.lidar.difop import helios_lasers, is_difop, read_difop
+from drivers.lidar.difop import describe, helios_lasers, is_difop, read_difop
 from drivers.lidar.imu import STANDARD_GRAVITY_M_S2, ImuDecoder
 from drivers.lidar.models import AIRY, E1, HELIOS16P, HELIOS32, M1, M2, M3, MODELS, RS16, SequencedModel, recognise
 from drivers.lidar.points import PointDecoder
@@ -287,6 +287,11 @@ def test_facts_of_a_helios() -> None:
     assert facts.device_s == START_US * 1e-6 + 0.5
     assert facts.setup is not None
     assert (facts.setup.is_dual, facts.setup.turns_per_s, facts.setup.blind_s) == (True, 20, 0.025)
+    told = json.loads(describe(b"\x01\x02", facts))
+    assert told["packet"] == "0102"
+    assert told["serial"] == "a1b2c3d4e5f6"
+    assert told["vertical_deg"] == (facts.setup.vertical / 100).tolist()
+    assert len(told["vertical_deg"]) == len(told["horizontal_deg"]) == 32
 
 
 @pytest.mark.parametrize("name", ["airy_single", "rs16_single"])

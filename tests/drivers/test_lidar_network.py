@@ -16,7 +16,7 @@ from drivers.device import DeviceError, Driver, driver_type
 from drivers.lidar import robosense, robosense_imu
 from drivers.lidar.models import recognise
 from drivers.lidar.robosense_decoder import RobosenseDecoder
-from drivers.lidar.watches import BadPacketWatch, SetupWatch
+from drivers.lidar.watches import BadPacketWatch, SetupWatch, Sparsely
 from drivers.links import UdpLink, UdpOptions
 from drivers.samples import ImuSample, Received, ScanSample
 from drivers.udp_batches import SLOTS
@@ -307,3 +307,11 @@ def test_a_lost_lock_is_told() -> None:
     (event,) = watch.events()
     assert event.text == "the lidar's sync state was locked and is timeout now"
     assert watch.events() == ()
+
+
+def test_counts_that_grow_are_told_sparsely_and_add_up() -> None:
+    told = Sparsely()
+    news = [told.news(total, second * 10**9, is_last=False) for second, total in enumerate([0, 5, 9, 9, 12], 100)]
+    assert news == [0, 5, 0, 0, 0]
+    assert told.news(20, 111 * 10**9, is_last=False) == 15
+    assert [told.news(total, 112 * 10**9, is_last=True) for total in (21, 21)] == [1, 0]

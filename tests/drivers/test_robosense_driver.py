@@ -114,6 +114,12 @@ def test_take_from_first_datagram_to_last_frame(network: Network) -> None:
     driver.close()
     assert [scan.packets_received for scan in scans_of(items)] == [40, 40, 30]
     assert events_of(items, "gap") == events_of(items, "drop") == []
+    ((name, told),) = [file for item in items for file in item.files]
+    assert (name, json.loads(told)["serial"], json.loads(told)["packet"]) == (
+        "difop.json",
+        "a1b2c3d4e5f6",
+        difop().hex(),
+    )
     chunks = [chunk for item in items for chunk in item.chunks]
     assert chunks[0].destination == (LIDAR, network.msop_port)
     for item in items:
@@ -155,14 +161,15 @@ def test_lost_packets_bad_packets_strangers(network: Network, monkeypatch: pytes
     network.send(*frame(1, 40)[:10], *frame(1, 40)[15:], *frame(2, 40))
     items = collect(reading, lambda items: chunk_count(items) == 117)
     items += collect(reading, lambda items: bool(events_of(items, "garbage")))
+    network.send(b"a burst that lasts when the take ends")
+    items += collect(reading, lambda items: chunk_count(items) == 1)
     stop.set()
     items += list(reading)
     driver.close()
     assert [scan.packets_received for scan in scans_of(items)] == [40, 35, 40]
     assert [event.count for event in events_of(items, "gap")] == [5]
-    assert [event.count for event in events_of(items, "garbage")] == [2]
-    (foreign,) = [event for event in events_of(items, "warning") if "other addresses" in event.text]
-    assert foreign.count == 40
+    assert [event.count for event in events_of(items, "garbage")] == [2, 1]
+    assert sum(event.count for event in events_of(items, "warning") if "other addresses" in event.text) == 40
 
 
 def test_kernel_drops_and_gaps_add_up(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
