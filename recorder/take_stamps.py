@@ -6,11 +6,10 @@ became of it when the take was refined.
 """
 
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from drivers.samples import ClockPairs, ScanSample
 from recorder.errors import StorageError
@@ -73,7 +72,7 @@ class TakeStamps:
             stamped = rows[rows[:, 2] != NONE]
             times_ns = [known.get((ticks, time_ns), time_ns) for ticks, _, time_ns in stamped.tolist()]
             (folder / name).write_bytes(np.array(times_ns, "<i8").tobytes())
-            manifest.resync = msgspec.structs.replace(summary, state="running")
+            manifest.resync = replace(summary, state="running")
             write_manifest(folder, manifest)
         except OSError as error:
             raise StorageError(f"{folder}: cannot take over the refined times of {self._take}: {error}") from error
