@@ -117,6 +117,7 @@ class Pipeline:
                 round(device.config.latency_s * NS_PER_S),
                 device.prior_skew_ppm,
                 device.config.level,
+                _have_one_counter([other for other in devices if other.clock == device.clock]),
             )
         cameras = sorted((device.camera, device.clock) for device in devices if device.camera is not None)
         clocks = list(dict.fromkeys(clock for _, clock in cameras))
@@ -325,6 +326,12 @@ def _floor_us(clock: ClockMap) -> tuple[float | None, float | None]:
     if clock.floor_ns is None or clock.floor_bound_ns is None:
         return None, None
     return clock.floor_ns / 1e3, clock.floor_bound_ns / 1e3
+
+
+def _have_one_counter(devices: list[DeviceInTake]) -> bool:
+    """Whether these are streams of one device (`oak.left`, `oak.right` ...), and their ticks need no unwrapping."""
+    names = {device.name.partition(".")[0] for device in devices}
+    return len(devices) > 1 and len(names) == 1 and not any(device.wrap_bits for device in devices)
 
 
 def _clock_summary(clock: ClockMap, tick_hz: float, wrap_bits: int, epochs: list[EpochSummary]) -> ClockSummary:

@@ -23,10 +23,12 @@ from recorder.scan_times import Ints, PointTicks
 HOLD_AT_START_NS = 1_000_000_000
 HOLD_NS = 400_000_000
 UNKNOWN_SKEW_PPM = 100.0
+NS_PER_S = 1_000_000_000
+FAR_NS = 60 * NS_PER_S
 
 
 class Stamped(Struct, frozen=True, eq=False):
-    """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock.
+    """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock, which runs on.
 
     arrival_ns: when it came, its device's latency not taken off.
     point_host_ns: host times of a scan's points, (n,) int64; the scan's time is the greatest.
@@ -52,14 +54,44 @@ class _DeviceStream:
     last_host_ns: int = -(1 << 62)
 
 
+# Stream, time on the axis of the clock map, device time (Stamped), arrival without latency, sample.
+_Waiting = tuple[_DeviceStream, int, int, int, Sample]
+
+
+@dataclass(slots=True)
+class _Counter:
+    """The one counter that stamps all streams of a device: their samples can be compared without any estimate.
+
+    Time runs on when the counter starts anew, from the arrival of what comes first then.
+    """
+
+    _zero_ns: int | None = None
+    _newest_ns: int = 0
+
+    def restart(self) -> None:
+        """The device was connected anew."""
+        self._zero_ns = None
+
+    def time_ns(self, count_ns: int, arrival_ns: int) -> int | None:
+        """Of a sample; None when it is too far from its arrival to be true."""
+        if self._zero_ns is None:
+            self._zero_ns = max(arrival_ns, self._newest_ns + NS_PER_S) - count_ns
+        time_ns = count_ns + self._zero_ns
+        if abs(time_ns - arrival_ns) > FAR_NS:
+            return None
+        self._newest_ns = max(self._newest_ns, time_ns)
+        return time_ns
+
+
 @dataclass(slots=True)
 class _Clock:
     name: str
     map: ClockMap
     hold_until_ns: int
+    counter: _Counter | None
     epoch: int = -1  # none yet
     is_new: bool = True
-    waiting: list[tuple[_DeviceStream, int, int, Sample]] = field(default_factory=list)
+    waiting: list[_Waiting] = field(default_factory=list)
 
 
 class Timebase:
@@ -88,10 +120,12 @@ class Timebase:
         latency_ns: int,
         prior_skew_ppm: tuple[float, float] | None = None,
         level: Level = "lowest",
+        has_one_counter: bool = False,
     ) -> None:
         """Announce a device and the clock that stamps it.
 
         prior_skew_ppm: its skew and sigma, where known before. level: as in ClockMap; that of a clock's first device.
+        has_one_counter: all that the clock stamps are streams of one device, by one counter that does not wrap.
         """
         if clock not in self._clocks:
             skew_ppm, sigma_ppm = prior_skew_ppm or (0.0, UNKNOWN_SKEW_PPM)
@@ -103,7 +137,8 @@ class Timebase:
                 inline_refit=self._inline_refit,
                 level=level,
             )
-            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS)
+            counter = _Counter() if has_one_counter else None
+            self._clocks[clock] = _Clock(clock, clock_map, self._start_ns + HOLD_AT_START_NS, counter)
         shared = self._clocks[clock]
         self._streams[device] = _DeviceStream(
             device, shared, shared.map.stream(tick_hz, wrap_bits), tick_hz, latency_ns
@@ -133,7 +168,10 @@ class Timebase:
 
     def reconnected(self, device: str) -> None:
         """The device was lost and is connected again: its clock may have restarted."""
-        self._streams[device].stream.expect_restart()
+        entry = self._streams[device]
+        entry.stream.expect_restart()
+        if entry.clock.counter is not None:
+            entry.clock.counter.restart()
 
     def polled_by(self, device: str, controller: str) -> None:
         """Which host controller polls the device's link. Those of one controller share what is known of its polls."""
@@ -156,12 +194,16 @@ class Timebase:
             bounds_ns = sample.not_before_ns, sample.not_after_ns
             clock.map.observe_two_way(sample.device_ticks, *bounds_ns, stream=entry.stream)
         elif isinstance(sample, ScanSample):
-            clock.waiting.append((entry, entry.stream.unwrap(sample.last_ticks), arrival_ns, sample))
+            axis_ns = entry.stream.unwrap(sample.last_ticks)
+            clock.waiting.append((entry, axis_ns, axis_ns, arrival_ns, sample))
         elif sample.device_ticks is None:
             self._unclocked.append(Stamped(device, arrival_ns, arrival_ns, arrival_ns + entry.latency_ns, sample))
         else:
-            device_ns = entry.stream.observe(sample.device_ticks, arrival_ns)
-            clock.waiting.append((entry, device_ns, arrival_ns, sample))
+            axis_ns = device_ns = entry.stream.observe(sample.device_ticks, arrival_ns)
+            if clock.counter is not None:
+                count_ns = round(sample.device_ticks * NS_PER_S / entry.tick_hz)
+                device_ns = clock.counter.time_ns(count_ns, arrival_ns) or axis_ns
+            clock.waiting.append((entry, axis_ns, device_ns, arrival_ns, sample))
         self._watch_epoch(clock, arrival_ns)
 
     def _watch_epoch(self, clock: _Clock, arrival_ns: int) -> None:
@@ -185,16 +227,16 @@ class Timebase:
                 stamped.extend(self._stamp_all(waiting))
         return stamped
 
-    def _stamp_all(self, waiting: list[tuple[_DeviceStream, int, int, Sample]]) -> list[Stamped]:
+    def _stamp_all(self, waiting: list[_Waiting]) -> list[Stamped]:
         """Samples that came together and would be stamped after their arrival are moved together: they stay apart."""
-        mapped_ns = [entry.stream.host_ns(device_ns) for entry, device_ns, _, _ in waiting]
+        mapped_ns = [entry.stream.host_ns(axis_ns) for entry, axis_ns, _, _, _ in waiting]
         beyond_ns: dict[tuple[str, int], int] = {}
-        for (entry, _, arrival_ns, _), host_ns in zip(waiting, mapped_ns, strict=True):
+        for (entry, _, _, arrival_ns, _), host_ns in zip(waiting, mapped_ns, strict=True):
             key = (entry.device, arrival_ns)
             beyond_ns[key] = max(beyond_ns.get(key, 0), host_ns - arrival_ns)
         return [
             self._stamp(host_ns - beyond_ns[entry.device, arrival_ns], entry, device_ns, arrival_ns, sample)
-            for (entry, device_ns, arrival_ns, sample), host_ns in zip(waiting, mapped_ns, strict=True)
+            for (entry, _, device_ns, arrival_ns, sample), host_ns in zip(waiting, mapped_ns, strict=True)
         ]
 
     def flush(self) -> list[Stamped]:

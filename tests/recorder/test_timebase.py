@@ -111,6 +111,42 @@ def test_devices_of_one_clock_share_its_map_and_may_differ_in_latency():
     assert list(timebase.clocks()) == ["cameras"]
 
 
+def test_streams_of_one_counter_stay_comparable_when_they_come_back_far_behind_each_other():
+    """By arrivals alone each stream's clock would be taken to have restarted at another instant."""
+    timebase = Timebase(START_NS)
+    streams = {"oak.left": 3 * MS, "oak.right": 3 * MS}
+    for name in streams:
+        timebase.add_device(name, "oak", 1e9, 0, 0, has_one_counter=True)
+    stamped: list[Stamped] = []
+    for life, behind_ms in ((0, (0, 0)), (1, (0, 900)), (2, (400, 0))):
+        begin_ns = START_NS + life * 10 * S
+        for name in streams:
+            timebase.reconnected(name)
+        arrivals = sorted(
+            (begin_ns + index * 50 * MS + delay_ns + late_ms * MS, name, index)
+            for (name, delay_ns), late_ms in zip(streams.items(), behind_ms, strict=True)
+            for index in range(40)
+        )
+        for arrival_ns, name, index in arrivals:
+            stamped += take(timebase, name, arrival_ns, imu(index * 50 * MS, life * 40 + index))
+    stamped += timebase.flush()
+    times = {name: [entry.device_ns for entry in stamped if entry.device == name] for name in streams}
+    assert times["oak.left"] == times["oak.right"]
+    assert times["oak.left"] == sorted(set(times["oak.left"]))
+
+
+def test_a_count_far_from_its_arrival_does_not_move_the_others():
+    timebase = Timebase(START_NS)
+    timebase.add_device("oak.left", "oak", 1e9, 0, 0, has_one_counter=True)
+    stamped: list[Stamped] = []
+    for index in range(100):
+        ticks = 1 << 60 if index == 50 else index * 50 * MS
+        stamped += take(timebase, "oak.left", START_NS + index * 50 * MS, imu(ticks, index))
+    stamped += timebase.flush()
+    times = [entry.device_ns for entry in stamped if entry.sample.sequence != 50]
+    assert np.diff(times).tolist() == [50 * MS] * 49 + [100 * MS] + [50 * MS] * 48
+
+
 def test_a_restarted_device_begins_an_epoch_that_is_told_once_held_and_stamped_well():
     timebase = one_device(wrap_bits=0)
     gone, back = 1000, 1400
