@@ -6,8 +6,11 @@ Columns: rms error in us from 10 s after the start on, the least delay of the li
 
     arrival   the arrival time itself
     first     device ticks from the first sample's offset
+    passive   from the quickest sample, which is worth less with age (Olson, IROS 2010)
+    index     recursive least squares over the sample index, half-time 90 s, as Lab Streaming Layer smooths
     hull      the line under all arrivals so far (Zhang, Liu, Xia, INFOCOM 2002), begun anew at a break
-    online    ClockMap, stamps given at once            ratio: to the better of `hull` and ClockMap without grid
+    beneath   ClockMap without the polling grid
+    online    ClockMap, stamps given at once            ratio: to the better of `hull` and `beneath`
     model     the same, level by the fitted delay law
     two       recorder.clock.refine, with all arrivals known
     cover     share of the online errors within two sigma of the stated uncertainty
@@ -187,6 +190,38 @@ def mapped(trace: Trace, clock: ClockMap) -> tuple[NDArray[np.int64], Floats, fl
     return stamps, sigma, (time.process_time() - begin) / trace.ticks.size * 1e6
 
 
+def passive(trace: Trace) -> NDArray[np.int64]:
+    """Device time from the sample with the least delay, drift of up to 200 ppm since then forgiven."""
+    device_ns = ((trace.ticks - trace.ticks[0]) * (1e9 / trace.tick_hz)).astype(np.int64)
+    stamps = np.empty_like(trace.arrival_ns)
+    best_device_ns, best_arrival_ns = int(device_ns[0]), int(trace.arrival_ns[0])
+    for i, (device, arrival) in enumerate(zip(device_ns.tolist(), trace.arrival_ns.tolist(), strict=True)):
+        ahead = device - best_device_ns
+        if ahead < 0 or arrival - best_arrival_ns - ahead <= 200 * 1e-6 * ahead:
+            best_device_ns, best_arrival_ns = device, arrival
+        stamps[i] = best_arrival_ns + device - best_device_ns
+    return np.minimum(stamps, trace.arrival_ns)
+
+
+def by_index(trace: Trace, rate_hz: float) -> NDArray[np.int64]:
+    """Arrival as a line over the sample index."""
+    forget = 0.5 ** (1 / (90 * rate_hz))
+    level_s, slope_s = 0.0, 1 / rate_hz
+    var_level, covariance, var_slope = 1e10, 0.0, 1e10
+    stamps = np.empty(trace.ticks.size)
+    for i, arrival_s in enumerate(((trace.arrival_ns - trace.arrival_ns[0]) / 1e9).tolist()):
+        level_s += slope_s
+        var_level = (var_level + 2 * covariance + var_slope) / forget
+        covariance, var_slope = (covariance + var_slope) / forget, var_slope / forget
+        gain, gain_slope = var_level / (1 + var_level), covariance / (1 + var_level)
+        error_s = arrival_s - level_s
+        level_s, slope_s = level_s + gain * error_s, slope_s + gain_slope * error_s
+        var_slope -= gain_slope * covariance
+        var_level, covariance = var_level * (1 - gain), covariance * (1 - gain)
+        stamps[i] = level_s
+    return trace.arrival_ns[0] + np.round(stamps * 1e9).astype(np.int64)
+
+
 def lower_hull(trace: Trace) -> NDArray[np.int64]:
     """Causal: each stamp from the hull edge over the middle of what has arrived."""
     stamps = np.empty(trace.ticks.size, np.int64)
@@ -251,6 +286,8 @@ def run(name: str, seeds: int, scale: float, settle_s: float) -> dict[str, float
             {
                 "arrival": rms(error(trace.arrival_ns)),
                 "first": rms(error(first)),
+                "passive": rms(error(passive(trace))),
+                "index": rms(error(by_index(trace, LINKS[name].rate_hz))),
                 "hull": rms(error(lower_hull(trace))),
                 "beneath": rms(error(beneath)),
                 "online": rms(error(online)),
@@ -350,14 +387,15 @@ def main() -> None:
     seeds, scale, settle_s = args.seeds, 1.0, 10.0
     if args.smoke:
         names, seeds, scale, settle_s = list(SMOKE), 1, 0.2, 10.0
-    columns = ("arrival", "first", "hull", "beneath", "online", "model", "two", "ratio", "cover", "width")
+    columns = ("arrival", "first", "passive", "index", "hull", "beneath", "online", "model", "two")
+    columns += ("ratio", "cover", "width")
     columns += ("cover2", "width2", "cpu")
     print(f"{'link':22s}" + "".join(f"{column:>9s}" for column in columns))
     worst = 0.0
     for name in names:
         row = run(name, seeds, scale, settle_s)
         worst = max(worst, row["ratio"])
-        cells = (f"{row[c]:9.2f}" if c in columns[7:] else f"{row[c]:9.1f}" for c in columns)
+        cells = (f"{row[c]:9.2f}" if c in columns[9:] else f"{row[c]:9.1f}" for c in columns)
         print(f"{name:22s}" + "".join(cells), flush=True)
     sharing(1 if args.smoke else 8)
     cost(scale)

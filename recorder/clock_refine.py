@@ -33,7 +33,7 @@ ROUNDS = 4
 FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
-LAW_ERROR = 0.02  # of the mean delay times the law's shape
+LAW_ERROR = 0.008  # of the mean delay times the square of the shape, as Weibull laws of shapes 1.2 to 2 ask for
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
 
 
@@ -215,7 +215,7 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
         best = problem.climb(best.weights, best.law, MANY_STEPS)
     variance = np.linalg.inv(best.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
     found = DelayLaw.of(best.law)
-    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), LAW_ERROR * found.shape * found.mean_ns)
+    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), LAW_ERROR * found.shape**2 * found.mean_ns)
     hidden = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
     return Curve(knots_x, level + best.weights, sigma), _trust(problem, best, at_x, points), hidden
 
