@@ -177,7 +177,7 @@ class _Decoding:
         self._failures: list[str] = []
         self._early_events: list[DeviceEvent] = []
         self._files: list[tuple[str, bytes]] = []
-        self._last_refusal = ""
+        self._refusal = ""
         self._device_time: _DeviceTime | None = None
         self._is_device_time_known = links.capture.has_arrivals
         self._first_ns: int | None = None
@@ -325,7 +325,7 @@ class _Decoding:
     def _note(self, event: DeviceEvent) -> None:
         count_event(self._summary, event)
         if event.kind == "warning":
-            self._last_refusal = event.text
+            self._refusal = self._refusal or event.text
         if self._writer is None:
             if len(self._early_events) < MAX_EARLY_EVENTS:
                 self._early_events.append(event)
@@ -366,8 +366,8 @@ class _Decoding:
         if fault:
             return fault
         told = f"{capture.path}: driver {self._device.config.driver} found nothing in it"
-        if self._last_refusal:
-            told += f" ({self._last_refusal})"
+        if self._refusal:
+            told += f" ({self._refusal})"
         return f"{told}; {survey(capture.path).text()}" if capture.has_arrivals else told
 
 

@@ -18,7 +18,7 @@ from drivers.lidar.models import HELIOS, M1, MODELS, Model, ModelKey, SequencedM
 from drivers.lidar.robosense_decoder import PointOptions, RobosenseDecoder
 from drivers.lidar.slots import DUAL_RETURN, NO_TICKS
 from drivers.lidar.watches import BadPacketWatch, LossWatch, SetupWatch
-from drivers.links import LIVE, SILENCE_S, Links, UdpOptions, UdpPorts
+from drivers.links import LIVE, RECEIVE_BUFFER_BYTES, SILENCE_S, Links, UdpOptions, UdpPorts
 from drivers.samples import POINT_DTYPE, Chunk, ClockPairs, Datagrams, DeviceEvent, Received, Sample, ScanSample
 
 FIRST_PACKET_S = 3.0
@@ -147,7 +147,7 @@ class RobosenseDriver:
         is_dual = isinstance(model, SequencedModel) and data[8] == DUAL_RETURN
         held_s = link.receive_buffer_bytes / (model.packets_per_s * (2 if is_dual else 1) * PACKET_SOCKET_BYTES)
         self._collect_s = min(COLLECT_S, held_s / 4)
-        events = _buffer_advice(held_s)
+        events = _buffer_advice(held_s, link.receive_buffer_bytes)
         if difop is None:
             text = f"no information packet on UDP port {config.difop_port}"
             if isinstance(model, SpinningModel):
@@ -301,11 +301,13 @@ def _bytes_per_s(model: Model) -> float:
     return model.packets_per_s * (point_bytes + model.packet_bytes + TAPE_BYTES_PER_PACKET)
 
 
-def _buffer_advice(held_s: float) -> list[DeviceEvent]:
+def _buffer_advice(held_s: float, granted_bytes: int) -> list[DeviceEvent]:
     """A warning when the socket's buffer cannot hold a second of data."""
     if held_s >= 1.0:
         return []
-    advice = "allow more with: sysctl -w net.core.rmem_max=33554432"
+    advice = f"allow more with: sudo sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES}"
+    if granted_bytes >= 2 * RECEIVE_BUFFER_BYTES:  # as Linux tells: twice of what was asked for, its own needs included
+        advice = "keep other work off this host"
     return [DeviceEvent("warning", f"the receive buffer holds only {held_s:.2f} s of this lidar's data; {advice}")]
 
 
