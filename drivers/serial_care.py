@@ -29,6 +29,7 @@ REMEMBERED_READS = 4096
 RECOGNISE_BYTES = 4096
 LINE_BYTES = 130
 TAPE_BLOCK_BYTES = 64
+BAUD_HINT = "; is the baud rate right?"
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600, 2000000, 4000000)
 RATE_AFTER_NS = 5_000_000_000
 RATE_TOLERANCE = 0.1
@@ -107,7 +108,7 @@ class Dialogue(Generic[Message]):
         count = sum(len(chunk.data) for chunk in self.chunks[first:] if not chunk.sent)
         came = f"{count} bytes of other data came" if count else "nothing came at all"
         if count:
-            came += describe(b"".join(chunk.data for chunk in self.chunks[first:] if not chunk.sent))
+            came += describe(b"".join(chunk.data for chunk in self.chunks[first:] if not chunk.sent)) or BAUD_HINT
         raise DeviceError(f"{self.where}: no answer to {name} ({TRIES} tries of {ANSWER_S:g} s; {came})")
 
     def send(self, data: bytes) -> None:
@@ -206,7 +207,7 @@ class Care:
         if arrival_ns - self._framed_ns <= self.silence_s * 1e9:
             return ()
         self._warned = True
-        looks_like = describe(self._unknown) or ("; is the baud rate right?" if self.is_serial else "")
+        looks_like = describe(self._unknown) or (BAUD_HINT if self.is_serial else "")
         text = f"{self.where}: bytes come, but no {self.message} for {self.silence_s:g} s{looks_like}"
         self._unknown = b""
         return (DeviceEvent("warning", text),)

@@ -14,11 +14,11 @@ CONNECT_S = 5.0
 KEEPALIVE_S = 5
 
 
-def host_and_port(text: str, key: str) -> tuple[str, int]:
-    """Both halves of host:port, the host may be empty. Raises DeviceError when that is not what it is."""
+def host_and_port(text: str) -> tuple[str, int]:
+    """Both halves of host:port, the host may be left out. Raises ValueError when that is not what it is."""
     host, _, port = text.rpartition(":")
-    if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise DeviceError(f"{key}: {text!r} is not host:port")
+    if not (port.isascii() and port.isdecimal()) or not 0 < int(port) < 65536:
+        raise ValueError(f"{text!r} does not end in a port (1 to 65535)")
     return host.strip("[]"), int(port)
 
 
@@ -31,7 +31,7 @@ class TcpLink:
     def __init__(self, address: str) -> None:
         """Connect to host:port. Raises DeviceError when that fails."""
         self._where = address
-        host, port = host_and_port(address, "tcp")
+        host, port = host_and_port(address)
         try:
             self._socket = socket.create_connection((host, port), CONNECT_S)
         except OSError as error:
@@ -88,7 +88,7 @@ class UdpByteLink:
 
     def __init__(self, links: Links, address: str) -> None:
         """Listen as [sender]:port says; without a sender the first one that is heard. Raises DeviceError."""
-        sender, port = host_and_port(address if ":" in address else f":{address}", "udp")
+        sender, port = host_and_port(address)
         self._links = links
         self._link = links.udp(sender or None, (port,))
         self._waiting: deque[Chunk] = deque()

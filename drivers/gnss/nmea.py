@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, field
 
 from drivers.device import DeviceConfig, DeviceError, DriverType, StreamSpec
-from drivers.gnss.network import TcpLink, UdpByteLink
+from drivers.gnss.network import TcpLink, UdpByteLink, host_and_port
 from drivers.gnss.nmea_decoder import (
     EMITTED_QUALITIES,
     UERE_M,
@@ -51,9 +51,13 @@ class NmeaConfig(DeviceConfig, frozen=True, kw_only=True):
     vertical_per_horizontal: Annotated[float, Meta(gt=0)] = VERTICAL_PER_HORIZONTAL
 
     def __post_init__(self) -> None:
-        """Raises ValueError when it is not told where the receiver is, or twice."""
+        """Raises ValueError when it is not told where the receiver is, or twice, or in a way that nobody understands."""
         if sum(map(bool, (self.port, self.tcp, self.udp))) != 1:
             raise ValueError("set one of port, tcp and udp")
+        if self.tcp and not host_and_port(self.tcp)[0]:
+            raise ValueError(f"tcp: {self.tcp!r} is not host:port")
+        if self.udp:
+            host_and_port(self.udp)
 
 
 class NmeaDriver:

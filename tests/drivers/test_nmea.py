@@ -630,7 +630,16 @@ def test_the_receiver_is_in_one_place(keys: dict[str, str]) -> None:
         NmeaConfig(driver="nmea", **keys)
 
 
-@pytest.mark.parametrize("address", ["host", "host:", "host:99999"])
-def test_address_on_the_network_that_is_none(address: str) -> None:
-    with pytest.raises(DeviceError, match="is not host:port"):
-        DRIVER.create("gnss", NmeaConfig(driver="nmea", tcp=address)).connect()
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"tcp": "host"}, r"'host' does not end in a port"),
+        ({"tcp": "host:"}, r"'host:' does not end in a port"),
+        ({"tcp": "host:99999"}, r"'host:99999' does not end in a port"),
+        ({"tcp": "2947"}, r"tcp: '2947' is not host:port"),
+        ({"udp": "sender"}, r"'sender' does not end in a port"),
+    ],
+)
+def test_address_on_the_network_that_is_none(keys: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        NmeaConfig(driver="nmea", **keys)
