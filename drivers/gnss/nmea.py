@@ -51,7 +51,7 @@ class NmeaConfig(DeviceConfig, frozen=True, kw_only=True):
     vertical_per_horizontal: Annotated[float, Meta(gt=0)] = VERTICAL_PER_HORIZONTAL
 
     def __post_init__(self) -> None:
-        """Raises ValueError when it is not told where the receiver is, or twice, or in a way that nobody understands."""
+        """Raises ValueError when it is not told where the receiver is, or twice, or not understandably."""
         if sum(map(bool, (self.port, self.tcp, self.udp))) != 1:
             raise ValueError("set one of port, tcp and udp")
         if self.tcp and not host_and_port(self.tcp)[0]:
