@@ -155,6 +155,7 @@ class Cast:
         self.ports = UdpPorts()
         self._faults = settings.faults
         self.lidars = settings.lidars
+        self._difop_ports: dict[str, int] = {}
         self._oaks = settings.oaks
         self._makers: dict[str, Callable[[str, dict[str, Any]], SimulatedDevice]] = {
             **dict.fromkeys(IMUS, self._imu),
@@ -200,14 +201,19 @@ class Cast:
     def _robosense(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, RobosenseSettings, f"devices.{name}")
         settings = self._with_ports(name, settings, ("msop_port", "difop_port"))
+        self._difop_ports[name] = settings.difop_port
         faults = self.faults(name, is_serial=False)
         setup = self.lidars.get(name, LidarSettings())
         return RobosenseSimulator(name, settings, self.stage, self.trajectory, self.room, faults, setup)
 
     def _robosense_imu(self, name: str, entry: dict[str, Any]) -> SimulatedDevice:
         settings = _convert(entry, RobosenseImuSettings, f"devices.{name}")
-        if settings.model == "airy":  # an e1's comes to a port of its lidar
+        if settings.model == "airy":
             settings = self._with_ports(name, settings, ("port",))
+        elif settings.clock in self._difop_ports:  # an e1's comes to a port of its lidar
+            settings = msgspec.structs.replace(settings, port=self._difop_ports[settings.clock])
+        else:
+            raise ValueError(f"devices.{name}.clock: must name the simulated e1 it belongs to, which stands before it")
         setup = self.lidars.get(name) or self.lidars.get(settings.clock) or LidarSettings()
         faults = self.faults(name, is_serial=False)
         return RobosenseImuSimulator(name, settings, self.stage, self.trajectory, faults, setup)

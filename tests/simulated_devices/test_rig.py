@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from recorder.errors import ConfigError
-from simulated_devices.rig import calibration, read_rig, simulate_settings, simulated_rig
+from simulated_devices.rig import Cast, SimulateSettings, calibration, read_rig, simulate_settings, simulated_rig
 from simulated_devices.scene import stereo_pair
 from simulated_devices.simulation import UdpPorts
 
@@ -241,6 +241,16 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
     assert (simulator.process.returncode, errors) == (1, "simulated device gnss ended by itself\n")
 
 
+def test_the_imu_of_an_e1_comes_to_a_port_of_its_lidar(tmp_path):
+    cast = Cast(SimulateSettings())
+    try:
+        lidar = cast.device("lidar", {"driver": "robosense", "model": "e1", "msop_port": 0, "difop_port": 0})
+        imu = cast.device("imu", {"driver": "robosense-imu", "model": "e1", "clock": "lidar"})
+    finally:
+        cast.ports.close()
+    assert imu.open(tmp_path)["port"] == lidar.open(tmp_path)["difop_port"]
+
+
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
@@ -280,6 +290,7 @@ def test_a_dead_device_ends_it_with_a_word(scratch_rig):
             ["devices.oak.imu_variant", "uncalibrated, calibrated, raw"],
         ),
         ("simulate.oaks.imu.loop=-1", ["simulate.oaks", "imu", "loop"]),
+        ("devices={imu: {driver: robosense-imu, model: e1, clock: lidar}}", ["devices.imu.clock", "e1"]),
     ],
 )
 def test_wrong_use_names_the_key_and_what_is_allowed(setting, words):
