@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recorder.formats import FormatError
+from recorder.formats.text import fault
 
 Order = Literal["row", "toro", "sqrt"]
 Matrix = npt.NDArray[np.float64]
@@ -113,7 +114,7 @@ def read_graph(path: Path, order: Order | None = None) -> Graph:
                     else:
                         graph.passed_over[words[0]] += 1
                 except ValueError as error:
-                    raise FormatError(f"{path}:{number}: {error}") from error
+                    raise fault(path, number, str(error)) from error
     except OSError as error:
         raise FormatError(f"{path}: cannot read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -177,7 +178,7 @@ def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
     while line := file.readline(MAX_LINE_CHARACTERS + 1):
         number += 1
         if len(line) > MAX_LINE_CHARACTERS:
-            raise FormatError(f"{path}:{number}: longer than {MAX_LINE_CHARACTERS} characters: not a graph")
+            raise fault(path, number, f"longer than {MAX_LINE_CHARACTERS} characters: not a graph")
         if line.strip() and line.lstrip()[0] not in "#%":
             yield number, line
 
@@ -215,13 +216,13 @@ def _ids(words: list[str], count: int) -> tuple[int, ...]:
 
 def _numbers(words: list[str], count: int, what: str) -> Values:
     if len(words) != count:
-        raise ValueError(f"{what} has {len(words)} numbers, {count} are needed")
+        raise ValueError(f"{what} has {len(words)} numbers, {count} are needed (is the line cut off?)")
     try:
         numbers = tuple(map(float, words))
     except ValueError as error:
         raise ValueError(f"{what}: not a number: {error}") from error
     if not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{what}: a number is not finite")
+        raise ValueError(f"{what}: a number is not finite; remove the line")
     return numbers
 
 
@@ -236,9 +237,11 @@ def _set_order(graph: Graph, path: Path, lines: list[int], order: Order | None) 
     not_toro = _first_indefinite(poses, _from_toro)
     looks_toro = not_row is not None and not_toro is None
     if order is None and not_row is not None and not looks_toro:
-        raise FormatError(
-            f"{path}:{lines[not_row]}: its information is no positive matrix, neither row by row nor in TORO's order; "
-            "say how it is written: --information row, toro or sqrt"
+        raise fault(
+            path,
+            lines[not_row],
+            "its information is no positive matrix, neither row by row nor in TORO's order; "
+            "say how it is written: --information row, toro or sqrt",
         )
     if looks_toro and order != "toro":
         told = "taken as such" if order is None else f"though --information {order} was asked for"
