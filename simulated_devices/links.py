@@ -127,9 +127,8 @@ class DatagramSender:
         self._stage = stage
         self._faults = faults
         self._is_perfect = faults == NO_FAULTS
-        self._message_faults = MessageFaults(faults, stage.seed, name)
         self._noise = Noise(faults, stage.seed, name)
-        self._holders: dict[tuple[str, int], list[Holder]] = {}
+        self._ways: dict[tuple[str, int], tuple[MessageFaults, list[Holder]]] = {}
 
     def __enter__(self) -> DatagramSender:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -148,15 +147,19 @@ class DatagramSender:
         now_ns = time.monotonic_ns()
         if self.schedule.is_mute(now_ns) or not self.schedule.is_plugged(now_ns):
             return
-        due = [(now_ns, self._noise.apply(sent)) for sent in self._message_faults.apply(bytes(data))]
-        for stage in self._holders_of(target):
+        message_faults, holders_on_way = self._way_to(target)
+        due = [(now_ns, self._noise.apply(sent)) for sent in message_faults.apply(bytes(data))]
+        for stage in holders_on_way:
             for due_ns, datagram in due:
                 stage.push(due_ns, datagram)
             due = stage.pop_due(now_ns)
         for _, datagram in due:
             self._socket.sendto(datagram, target)
 
-    def _holders_of(self, target: tuple[str, int]) -> list[Holder]:
-        if target not in self._holders:
-            self._holders[target] = holders(self._faults, self._stage.seed, self._name, datagrams=True)
-        return self._holders[target]
+    def _way_to(self, target: tuple[str, int]) -> tuple[MessageFaults, list[Holder]]:
+        """What happens on the way there: what is late at one port does not come to another."""
+        if target not in self._ways:
+            name = f"{self._name} {len(self._ways)}" if self._ways else self._name
+            message_faults = MessageFaults(self._faults, self._stage.seed, name)
+            self._ways[target] = message_faults, holders(self._faults, self._stage.seed, self._name, datagrams=True)
+        return self._ways[target]

@@ -198,3 +198,16 @@ def test_held_datagrams_come_with_a_later_one(world):
             receiver.setblocking(False)
             with pytest.raises(BlockingIOError):
                 receiver.recv(100)
+
+
+def test_what_is_late_at_one_port_does_not_come_to_another(world):
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        for receiver in (first, second):
+            receiver.bind(("127.0.0.1", 0))
+            receiver.setblocking(False)
+        with DatagramSender("lidar", world, FaultSettings(late_rate=0.5)) as sender:
+            for _ in range(100):
+                sender.sendto(b"first", first.getsockname())
+                sender.sendto(b"second", second.getsockname())
+        for receiver, data in ((first, b"first"), (second, b"second")):
+            assert {receiver.recv(100) for _ in range(80)} == {data}  # fifteen at most are still held
