@@ -38,6 +38,7 @@ ADVANCE_NS = 20_000_000
 DISK_EVERY_NS = 1_000_000_000
 DEFAULT_BAUD = 115200
 PORT_KEYS = frozenset(("port", "msop_port", "difop_port", "imu_port"))
+WHERE_KEYS = PORT_KEYS | {"address", "source_port"}
 MAX_EARLY_EVENTS = 100
 MAX_FILES = 10
 
@@ -126,7 +127,9 @@ def _tape(path: Path, driver: str, settings: tuple[str, ...]) -> _Tape | None:
         return None
     is_refined = manifest.resync is not None and manifest.resync.state == "done"
     resync = manifest.resync if is_refined else None
-    return _Tape(folder, entry, manifest.utc_at_time_0.by_host_ns, resync, keeps_times=not settings)
+    changed = apply_settings(entry, settings)
+    keeps_times = all(changed[key] == entry.get(key) for key in changed.keys() - WHERE_KEYS)
+    return _Tape(folder, entry, manifest.utc_at_time_0.by_host_ns, resync, keeps_times)
 
 
 def _device(path: Path, driver: str, settings: tuple[str, ...], tape: _Tape | None) -> RigDevice:

@@ -15,7 +15,7 @@ from drivers.samples import POINT_DTYPE, Chunk, DeviceEvent
 from recorder.cli import main
 from recorder.decode import decode
 from recorder.errors import ConfigError, RecorderError, StorageError
-from recorder.recording.raw import RawWriter
+from recorder.recording.raw import NONE, RawWriter
 
 START_S = 1_700_000_000
 LIDAR = ("192.168.1.200", 6699)
@@ -251,6 +251,26 @@ def test_a_tape_in_its_recording_keeps_the_takes_time_and_settings(tmp_path: Pat
         == json.loads((first / "recording.json").read_text())["utc_at_time_0"]["utc_ns"]
     )
     assert decoded.manifest.devices["robosense"].latency_s == 0.01
+
+
+def test_a_tape_gives_the_stamps_of_its_take_but_with_other_settings(tmp_path: Path) -> None:
+    first = tmp_path / "first"
+    Decoding(tape(tmp_path / "rec", "lidar", datagrams(8)), "robosense", first)
+    (first / "raw" / "robosense.pcapng").write_bytes((tmp_path / "rec" / "raw" / "lidar.pcapng").read_bytes())
+    moved_ns = 123_457  # as if the clock map had been asked at other moments
+    table = np.fromfile(first / "raw" / "robosense.clock", "<i8").reshape(-1, 3)
+    table[table[:, 2] != NONE, 2] += moved_ns
+    table.tofile(first / "raw" / "robosense.clock")
+    scans = [np.fromfile(path, POINT_DTYPE) for path in sorted((first / "lidar").iterdir())]
+
+    def moved_s(name: str, *settings: str) -> float:
+        Decoding(first / "raw" / "robosense.pcapng", "robosense", tmp_path / name, *settings)
+        again = [np.fromfile(path, POINT_DTYPE) for path in sorted((tmp_path / name / "lidar").iterdir())]
+        return max(np.abs(two["timestamp"] - one["timestamp"]).max() for one, two in zip(scans, again, strict=True))
+
+    assert moved_s("again") == pytest.approx(moved_ns / 1e9, abs=2e-9)
+    assert moved_s("by address", "address=192.168.1.200") == pytest.approx(moved_ns / 1e9, abs=2e-9)
+    assert moved_s("other settings", "max_range_m=50") == 0.0
 
 
 def test_stopping_finishes_what_has_been_read(tmp_path: Path) -> None:
