@@ -232,6 +232,15 @@ def late(table: Table, source: Path, trajectory: str) -> None:
         table.add(f"second camera {late_ms:g} ms late", text, f"{late_ms:g} +- 0.05 ms", good)
 
 
+def cost(table: Table, folder: Path) -> None:
+    """CPU of all threads, for one camera's share of a minute."""
+    begin_s = time.process_time()
+    found = look(folder)
+    video_s = found.looked_at_s * len(found.cameras)
+    minute_s = 60 * (time.process_time() - begin_s) / video_s
+    table.add("a minute of one video", f"{minute_s:.0f} s of CPU, from {video_s:.0f} s of video", "40 s", minute_s < 40)
+
+
 def run(folder: Path, ideal: bool, smoke: bool) -> int:
     table = Table()
     make = twin if ideal or smoke else take
@@ -265,6 +274,7 @@ def run(folder: Path, ideal: bool, smoke: bool) -> int:
     table.offset("gentle", gentle, 0, 0.7, 0.15, stamped_late_ms(gentle))
     steps(table, "gentle", gentle)
     drift(table, "gentle", gentle)
+    cost(table, gentle)
     late(table, brisk if ideal else twin(folder / "brisk-twin", "brisk", 12), "brisk")
     return table.failed
 

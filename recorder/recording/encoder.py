@@ -84,7 +84,8 @@ class Encoder:
             self._set_up(context, video)
             context.open()
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            raise EncoderError(f"{self.codec} cannot be used for {video.width}x{video.height}: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise EncoderError(f"{self.codec} cannot be used for {video.width}x{video.height}: {reason}") from error
 
     def _set_up(self, context: VideoCodecContext, video: VideoFormat) -> None:
         context.width, context.height = video.width, video.height
