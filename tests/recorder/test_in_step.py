@@ -28,7 +28,7 @@ EXAMPLES = int(os.environ.get("RIGTAPE_EXAMPLES", "8"))
 CAMERAS = ("left", "right")  # the left one sends H.264, the right one raw pictures
 
 FAULT = st.tuples(
-    st.sampled_from(["lost", "other size", "short", "late", "slow", "encoder"]),
+    st.sampled_from(["lost", "other size", "damaged", "late", "slow", "encoder"]),
     st.integers(0, COUNT - 1),
     st.integers(1, 9),
 )
@@ -49,8 +49,9 @@ def samples_of(name, pictures, faults):
     for index, frame in enumerate(frames):
         kinds = {kind for kind, first, length in faults if first <= index < first + length}
         sample = small[index] if "other size" in kinds else frame
-        if "short" in kinds and name == "right":
-            sample = FrameSample(frame.device_ticks, frame.packet[:-1], True, frame.video, None)
+        if "damaged" in kinds:
+            damaged = frame.packet[:-1] if name == "right" else frame.packet[5:]
+            sample = FrameSample(frame.device_ticks, damaged, frame.is_keyframe, frame.video, None)
         if "lost" in kinds:
             sample = LostFrame(frame.device_ticks)
         earliest_ns = max(earliest_ns, index * 50 * MS + 3 * MS + (800 * MS if "late" in kinds else 0))
