@@ -121,12 +121,10 @@ class PollingGrid:
         period = self.period_ns * (1 + self.tracker.frequency)
         if not period or not self.points:
             return None
-        first = self.points[0].x[0]
-        x = np.concatenate([p.events_x - first for p in self.points])
+        points = self.points[:]
 
         def hidden(slope: float) -> Hidden:
-            phase = np.sort(x * (1 + slope) % period)
-            gap = float(np.diff(phase, append=phase[0] + period).max())
+            gap = widest_gap(points, period, slope)
             return Hidden(gap, gap) if period < COARSE_NS else Hidden(max(gap, COARSE_ERROR * period), period)
 
         return hidden
@@ -324,6 +322,13 @@ def without_late(
         good &= np.bincount(bucket, count * rank) / total < np.maximum(HIGH_RANK, HIGH_SIGMA * 0.29 / np.sqrt(total))
     kept = good[bucket]
     return np.where(kept, count, 0.0) if count[kept].sum() > MIN_KEPT * count.sum() else count
+
+
+def widest_gap(points: list[GridPoints], period: float, slope: float) -> float:
+    """Of the phases of the samples against the polls: so far the floor may be hidden from the lowest arrivals."""
+    x = np.concatenate([p.events_x for p in points])
+    phase = np.sort((x - x[0]) * (1 + slope) % period)
+    return float(np.diff(phase, append=phase[0] + period).max())
 
 
 def ramp(value: float, good: float, bad: float) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recorder.clock_fit import LEVEL, Floats, Level, SlopePrior, hull_slope, touching_error
 from recorder.clock_grid import LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
-from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, without_late
+from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
 
 Ints = NDArray[np.int64]
 
@@ -33,7 +33,9 @@ ROUNDS = 4
 FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
-LAW_ERROR = 0.008  # of the mean delay times the square of the shape, as Weibull laws of shapes 1.2 to 2 ask for
+LOWEST = 1.0  # of the median delay by the root of their number: how late the quickest is, for gamma laws of shape 2
+GAP_SIGMA = 0.5  # of the gap between the samples' phases that may hide the floor
+LAW_ERROR = 0.008  # of the mean delay times the law's shape, times the shape again but at least 2: see docs/clocks.md
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
 
 
@@ -158,11 +160,12 @@ def envelope_by_data(x: Floats, y: Floats, prior: SlopePrior | None = None) -> C
         curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], spacing_s), prior)
         limit_ns = CLEAR * float(np.median(y - curve.at(x)))
     _, unsure = touching_error(low_y - curve.at(low_x), curve.knots_x.size - 1)
-    return replace(curve, sigma_ns=LEVEL * unsure)
+    lowest = LOWEST * float(np.median(y - curve.at(x))) / math.sqrt(x.size)
+    return replace(curve, sigma_ns=math.hypot(LEVEL * unsure, lowest))
 
 
-def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], float]:
-    """All samples on the polls of the link, by seconds, and the period; nothing without a grid."""
+def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], float, float]:
+    """All samples on the polls of the link, by seconds, the nominal period and the true one; nothing without a grid."""
     arrival = np.sort(x + y)
     tracker = GridTracker()
     cuts = np.searchsorted(arrival, np.arange(arrival[0] + S, arrival[-1], S))
@@ -170,22 +173,23 @@ def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], f
         if part.size:
             tracker.feed(part)
     if not tracker.period_ns:
-        return [], 0.0
+        return [], 0.0, 0.0
     tracker = tracker.rewound(arrival[:CHUNK_ARRIVALS])
     cuts = np.searchsorted(x, np.arange(x[0] + S, x[-1], S))
     parts = zip(np.split(x, cuts), np.split(y, cuts), strict=True)
     points = [snap(part_x, part_y, slope, tracker) for part_x, part_y in parts if part_x.size]
-    return [p for p in points if p is not None], tracker.period_ns
+    return [p for p in points if p is not None], tracker.period_ns, tracker.period_ns * (1 + tracker.frequency)
 
 
 def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -> tuple[Curve, float, float] | None:
     """The offset by the likelihood of the polls (`recorder.clock_grid`) near the envelope, and how far to trust it.
 
-    Third, how far above the floor the polls usually leave the envelope: with n delays that begin like a gamma law of
-    shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less than d late.
+    Third, one sigma of the height above the floor at which the polls leave the envelope: with n delays that begin like
+    a gamma law of shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less than d late; and anything
+    within the widest gap of the samples' phases against the polls is possible.
     """
     slope = float((beneath.heights[-1] - beneath.heights[0]) / (beneath.knots_x[-1] - beneath.knots_x[0]))
-    points, period = grid_points(x, y, slope)
+    points, period, true_period = grid_points(x, y, slope)
     if not points or x[-1] - x[0] < 2 * MIN_SPAN_S * S:
         return None
     at_x, at_y, count = (np.concatenate([getattr(p, name) for p in points]) for name in ("x", "y", "count"))
@@ -215,9 +219,12 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
         best = problem.climb(best.weights, best.law, MANY_STEPS)
     variance = np.linalg.inv(best.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
     found = DelayLaw.of(best.law)
-    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), LAW_ERROR * found.shape**2 * found.mean_ns)
-    hidden = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
-    return Curve(knots_x, level + best.weights, sigma), _trust(problem, best, at_x, points), hidden
+    law_error = LAW_ERROR * found.shape * max(found.shape, 2.0) * found.mean_ns
+    heights = level + best.weights
+    gap = widest_gap(points, true_period, float(heights[-1] - heights[0]) / float(knots_x[-1] - knots_x[0]))
+    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), law_error, GAP_SIGMA * gap)
+    lowest = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
+    return Curve(knots_x, heights, sigma), _trust(problem, best, at_x, points), math.hypot(lowest, GAP_SIGMA * gap)
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
