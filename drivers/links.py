@@ -58,8 +58,11 @@ WALL_CLOCK_STEP_NS = 1_000_000
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
+SO_MEMINFO = 55
+MEMINFO_DROPS = 8
 _TIMESPEC = struct.Struct("@ll")
 _UINT32 = struct.Struct("@I")
+_MEMINFO = struct.Struct("@9I")
 
 
 class SerialLink:
@@ -236,6 +239,7 @@ class UdpLink:
         """What has come on all ports, in order of arrival; empty after `timeout_s`."""
         events = self._readable.poll(0 if self._given else _milliseconds(timeout_s))
         if not events and not self._given:
+            self._count_last_drops()
             return []
         offset_ns = _realtime_minus_monotonic_ns()
         wall_clock_was_set = abs(offset_ns - self._realtime_minus_monotonic_ns) > WALL_CLOCK_STEP_NS
@@ -243,7 +247,7 @@ class UdpLink:
         parts: list[Sequence[Chunk]] = []
         for descriptor, _ in events:
             # What waits may have been stamped before the wall clock was set: then the time of reading is the truth.
-            with self._shared[descriptor].lock if descriptor in self._shared else contextlib.nullcontext():
+            with self._locked(descriptor):
                 parts += self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns)
         if self._given:
             parts.append([self._given.popleft() for _ in range(len(self._given))])
@@ -348,8 +352,21 @@ class UdpLink:
 
     def _count_kernel_drops(self, descriptor: int, total: int) -> None:
         seen = self._shared[descriptor].drops_seen if descriptor in self._shared else self._drops_by_socket
-        self.kernel_drops += (total - seen.get(descriptor, 0)) & 0xFFFFFFFF
-        seen[descriptor] = total
+        new = (total - seen.get(descriptor, 0)) & 0xFFFFFFFF
+        if new < 1 << 31:  # else it is an older count, of a datagram that had waited
+            self.kernel_drops += new
+            seen[descriptor] = total
+
+    def _count_last_drops(self) -> None:
+        """What was dropped after the last datagram that came is told by none."""
+        for descriptor, udp in self._sockets.items():
+            with self._locked(descriptor), contextlib.suppress(OSError):  # Linux before 4.12 has no such option
+                memory = udp.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
+                self._count_kernel_drops(descriptor, _MEMINFO.unpack(memory)[MEMINFO_DROPS])
+
+    def _locked(self, descriptor: int) -> contextlib.AbstractContextManager[object]:
+        """Of links that share the socket, only one at a time."""
+        return self._shared[descriptor].lock if descriptor in self._shared else contextlib.nullcontext()
 
     def close(self) -> None:
         """Close all sockets that no other link uses."""
