@@ -128,7 +128,7 @@ def _decoded_size(codec: str, key_frame: bytes) -> Size | None:
     """Size of a picture that can be decoded alone, None when it can't."""
     decoder = av.CodecContext.create(codec, "r")
     assert isinstance(decoder, VideoCodecContext)
-    decoder.options = {"max_pixels": str(MAX_PIXELS)}
+    decoder.options = {"max_pixels": str(MAX_PIXELS), "flags": "+output_corrupt"}  # as of a gradual refresh
     try:
         frames: list[VideoFrame] = [*decoder.decode(Packet(key_frame)), *decoder.decode(None)]
     except av.error.FFmpegError:

@@ -16,13 +16,15 @@ ENCODERS = {
     "hevc": ("libx265", "yuv420p", {"x265-params": "repeat-headers=1:annexb=1:keyint=5:bframes=0:log-level=none"}),
     "mjpeg": ("mjpeg", "yuvj420p", {}),
 }
+REFRESHED = {"x264-params": "repeat-headers=1:annexb=1:keyint=5:intra-refresh=1:log-level=error"}
 COUNT, KEY, BETWEEN = 12, 5, 3
 
 
 @lru_cache
-def film(codec: str, width: int = 64, height: int = 48) -> tuple[bytes, ...]:
-    """Packets of moving pictures, a key frame at every fifth."""
+def film(codec: str, width: int = 64, height: int = 48, *, refreshed: bool = False) -> tuple[bytes, ...]:
+    """Packets of moving pictures, a key frame at every fifth; refreshed: a gradual refresh in place of key frames."""
     name, pixels, options = ENCODERS[codec]
+    options = REFRESHED if refreshed else options
     context = av.CodecContext.create(name, "w")
     context.width, context.height, context.pix_fmt = width, height, pixels
     context.framerate, context.time_base = Fraction(20), Fraction(1, 20)
@@ -75,6 +77,10 @@ def test_another_size_within_the_stream_is_told_as_long_as_it_lasts(codec):
     assert found[5] == text
     assert found[10:] == [None] * 7
     assert found[:5] == [None] * 5
+
+
+def test_a_stream_without_key_frames_can_be_joined():
+    assert faults("h264", film("h264", refreshed=True)[KEY:]) == [None] * (COUNT - KEY)
 
 
 def test_other_codecs_are_not_looked_into():
