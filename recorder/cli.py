@@ -192,7 +192,7 @@ def replay(recording: Path, speed: float) -> None:
 
     What is on the raw tape comes byte for byte with the timing it had: serial lines as ptys, datagrams on their ports,
     pictures over TCP with the camera's own stamps. Without a tape (recordings imported from other systems) the samples
-    are sent at their times in protocols that carry them. It starts 8 s after the first device is opened (13 s when
+    are sent at their times in protocols that carry them. It starts 6 s after the first device is opened (11 s when
     not all have been by then) and ends with the recording.
 
     \b

@@ -29,6 +29,7 @@ PictureScript = Iterable[tuple[int, int, Any]]
 """Due, time stamp in microseconds, packet."""
 
 _WAITING_S = 0.02
+_PATIENCE_NS = 5 * SECOND_NS  # so late may a reader be before a line loses bytes, as lines do
 _UDP_TABLE = Path("/proc/net/udp")
 _CLIENT_STUCK_S = 1.0
 
@@ -81,9 +82,14 @@ class SerialReplay:
         for due_ns, data in self._script():
             host_ns = self._performance.host_ns(due_ns)
             self._listen_until(host_ns)
+            while self._pty.is_full() and time.monotonic_ns() < host_ns + _PATIENCE_NS:
+                self._listen_until(time.monotonic_ns() + MILLISECOND_NS)
             self._pty.send(data)
             self._pacer.done(host_ns)
-        self._listen_until(time.monotonic_ns() + SECOND_NS)  # a hang-up would take away what was not read yet
+        end_ns = time.monotonic_ns() + SECOND_NS
+        while time.monotonic_ns() < end_ns:  # a hang-up would take away what was not read yet
+            self._pty.send(b"")
+            self._listen_until(time.monotonic_ns() + 20 * MILLISECOND_NS)
 
     def _listen_until(self, host_ns: int) -> None:
         while time.monotonic_ns() < host_ns:

@@ -304,6 +304,11 @@ class Pty:
         self.lost_bytes += len(self._held[PORT_BUFFER_BYTES:])
         del self._held[PORT_BUFFER_BYTES:]
 
+    def is_full(self) -> bool:
+        """Whether bytes are held because the other side, which is open, does not read."""
+        self.send(b"")
+        return len(self._held) > PORT_BUFFER_BYTES // 2
+
     def receive(self) -> bytes:
         """What the other side has sent, b"" for nothing."""
         try:
