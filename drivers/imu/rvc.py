@@ -2,7 +2,7 @@
 
 from drivers.device import DriverType
 from drivers.imu.rvc_decoder import FRAME_BYTES, RATE_HZ, RvcDecoder
-from drivers.serial_care import SerialConfig, SerialDriver
+from drivers.serial_care import SerialConfig, SerialDriver, check_bandwidth
 
 
 class RvcConfig(SerialConfig, frozen=True, kw_only=True):
@@ -25,6 +25,9 @@ class RvcDriver(SerialDriver[RvcDecoder]):
     def tick_hz(self) -> float:
         """Messages a second."""
         return RATE_HZ
+
+    def _check(self) -> None:
+        check_bandwidth(self._serial.port, RATE_HZ, self._serial.baud, lambda rate_hz: rate_hz * FRAME_BYTES, ())
 
     def _sample_bytes(self) -> float:
         return FRAME_BYTES

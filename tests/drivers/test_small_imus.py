@@ -170,6 +170,12 @@ def test_a_silent_port_stays_open_and_its_first_bytes_count(monkeypatch: pytest.
     driver.close()
 
 
+def test_rvc_needs_a_fast_line() -> None:
+    config = rvc.RvcConfig(driver="bno08x-rvc", port="/dev/nowhere", baud=9600)
+    with pytest.raises(DeviceError, match=r"100 Hz need 1900 bytes/s.*set baud 38400 or more"):
+        rvc.DRIVER.create("imu", config).connect()
+
+
 # Lines of numbers
 
 
