@@ -37,12 +37,14 @@ class GarbageWatch:
     def events(self, now_ns: int) -> tuple[DeviceEvent, ...]:
         """The event of a burst that is over, else nothing."""
         counters = (self.decoder.bad_frames, self.decoder.skipped_bytes)
+        if counters == self._reported:
+            return ()
         if counters != self._seen:
             if self._seen == self._reported:
                 self._begin_ns = now_ns
             self._seen, self._last_growth_ns = counters, now_ns
         is_over = now_ns - self._last_growth_ns >= BURST_END_NS or now_ns - self._begin_ns >= BURST_MAX_NS
-        if self._seen == self._reported or not is_over:
+        if not is_over:
             return ()
         frames, skipped = (new - old for new, old in zip(self._seen, self._reported, strict=True))
         self._reported = self._seen

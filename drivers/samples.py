@@ -164,7 +164,7 @@ class TwoWayPair:
 Sample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample | ClockPairs | TwoWayPair
 
 
-class Chunk(Struct, frozen=True):
+class Chunk(Struct, frozen=True, gc=False):
     """Bytes as they came from (or went to) the wire, for the raw tape.
 
     source, destination: (address, port) of a datagram, None on a serial line. sent: written by us.
@@ -216,7 +216,7 @@ class DeviceEvent:
     count: int = 0
 
 
-class Received(Struct, frozen=True):
+class Received(Struct, frozen=True, gc=False):
     """What one read of a link brought: raw chunks, and the samples that became complete with their arrival.
 
     Arrival times are nanoseconds of the host's monotonic clock.

@@ -189,7 +189,7 @@ class Pipeline:
         device = self._devices[stamped.device]
         device.last_host_ns = stamped.host_ns
         time_ns = stamped.host_ns - self._start_ns
-        if isinstance(stamped.sample, FrameSample | LostFrame):
+        if isinstance(stamped.sample, (FrameSample, LostFrame)):  # a union would be made anew for each sample
             line_ns = self._place_picture(device, time_ns, stamped.device_ns, stamped.sample)
             self._tables[stamped.device].rows.append((stamped.sample.device_ticks, stamped.arrival_ns, line_ns))
             return

@@ -44,7 +44,7 @@ class _LastTimes:
         self.before_ns, self.last_ns = self.last_ns, time_ns
 
 
-class Released(Struct, Generic[T, P], frozen=True):
+class Released(Struct, Generic[T, P], frozen=True, gc=False):
     """One item in its turn. late: items of a later time were given out before."""
 
     time_ns: int

@@ -27,7 +27,7 @@ NS_PER_S = 1_000_000_000
 FAR_NS = 60 * NS_PER_S
 
 
-class Stamped(Struct, frozen=True, eq=False):
+class Stamped(Struct, frozen=True, eq=False, gc=False):
     """A sample with its host time, in monotonic ns. device_ns: the same instant on the device's clock, which runs on.
 
     arrival_ns: when it came, its device's latency not taken off.
