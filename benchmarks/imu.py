@@ -269,7 +269,7 @@ def main() -> int:
     parser.add_argument("--smoke", action="store_true")
     is_smoke = parser.parse_args().smoke
     factor = SMOKE_FACTOR if is_smoke else 1
-    frames = list(itertools.islice(mtdata2_frames(), 2000 if is_smoke else 4000))
+    frames = list(itertools.islice(mtdata2_frames(), 2000 if is_smoke else 10_000))
     costs_us = imu_costs_us(SAMPLES, 5 if is_smoke else REPETITIONS)
     limits_us = dict.fromkeys(costs_us, LIMIT_US * factor)
     costs_us["whole way to data.jsonl, xsens"] = min(whole_way_us(frames) for _ in range(3 if is_smoke else 10))
