@@ -52,6 +52,7 @@ DATAGRAMS_PER_READ = 512
 GIVEN_DATAGRAMS = 20_000
 RECEIVE_BUFFER_BYTES = 32 << 20
 SILENCE_S = 3.0
+NEVER_NS = 1 << 63
 WRITE_TIMEOUT_S = 2.0
 WALL_CLOCK_STEP_NS = 1_000_000
 
@@ -245,15 +246,24 @@ class UdpLink:
         wall_clock_was_set = abs(offset_ns - self._realtime_minus_monotonic_ns) > WALL_CLOCK_STEP_NS
         self._realtime_minus_monotonic_ns = offset_ns
         parts: list[Sequence[Chunk]] = []
+        limit_ns = NEVER_NS  # a port has more than it has given: what came later on another one waits for that
         for descriptor, _ in events:
             # What waits may have been stamped before the wall clock was set: then the time of reading is the truth.
             with self._locked(descriptor):
-                parts += self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns)
-        if self._given:
+                drained = self._drain(self._sockets[descriptor], None if wall_clock_was_set else offset_ns)
+            parts += drained
+            if sum(map(len, drained)) >= DATAGRAMS_PER_READ:
+                limit_ns = min(limit_ns, drained[-1][-1].arrival_ns)
+        if self._given and self._given[0].arrival_ns <= limit_ns:
             parts.append([self._given.popleft() for _ in range(len(self._given))])
         if len(parts) == 1:
             return parts[0]
-        return sorted((chunk for part in parts for chunk in part), key=lambda chunk: chunk.arrival_ns)
+        chunks = sorted((chunk for part in parts for chunk in part), key=lambda chunk: chunk.arrival_ns)
+        later = [chunk for chunk in chunks if chunk.arrival_ns > limit_ns]
+        if len(self._given) + len(later) > GIVEN_DATAGRAMS:
+            return chunks
+        self._given.extend(later)
+        return chunks[: len(chunks) - len(later)]
 
     def _drain(self, udp: socket.socket, offset_ns: int | None) -> list[Sequence[Chunk]]:
         """Read what waits on one socket, by the batch where the system can."""

@@ -303,6 +303,21 @@ def test_several_ports_are_merged_by_arrival() -> None:
     link.close()
 
 
+def test_a_port_that_is_behind_holds_back_what_came_later_on_others() -> None:
+    link = UdpLink(LOCALHOST, (0, 0))
+    send(link, *[bytes(100)] * 1100)
+    send(link, b"later", port_index=1)
+    send(link, b"last")
+    reads = [link.read(0.1) for _ in range(3)]
+    chunks = [chunk for part in reads for chunk in part]
+    assert [len(part) for part in reads[:2]] == [512, 512]
+    assert [chunk.data for chunk in chunks[-2:]] == [b"later", b"last"]
+    arrivals_ns = [chunk.arrival_ns for chunk in chunks]
+    assert arrivals_ns == sorted(arrivals_ns)
+    assert len(chunks) == 1102
+    link.close()
+
+
 def test_empty_and_longest_datagram(udp: UdpLink) -> None:
     longest = bytes(65507)
     send(udp, b"", longest)
