@@ -4,7 +4,7 @@
 
 A simulated OAK in a process of its own sends real depthai messages: a stereo pair of 1280x800 at 30 Hz and an IMU at
 400 Hz. Counted is the CPU of the process that records, in shares of one core, but for the thread that stands for the
-device (it reads a socket and makes the messages, as depthai's own threads do for a real one).
+device (it reads a socket and makes the messages, as depthai's own threads do for a real one), from when pictures come.
 
 passthrough: H.264 of the device, limit 0.15. raw: gray pictures, encoded here, limit 0.5. Both: nothing may be lost,
 all frame sets complete, and the number drawn into each picture must be the one its line is due.
@@ -32,7 +32,7 @@ from drivers.device import driver_type
 from recorder.recording.manifest import Manifest
 from recorder.recording.raw import read_clock_table
 from recorder.rig import parse_rig
-from recorder.session import record
+from recorder.session import TakeStatus, record
 from recorder.simulation import SimulatedRig
 from simulated_devices.oak_host import THREAD_NAME
 from simulated_devices.oak_pictures import STAMP_NS, read_number
@@ -92,21 +92,24 @@ def take(mode: str, source: dict[str, Any], duration_s: float, out: Path) -> tup
     try:
         loaded = parse_rig(simulated.yaml, "simulated rig", out)
 
-        def mark(_: object) -> None:
-            marks.append((time.monotonic(), time.process_time(), link.read()))
+        def mark(status: TakeStatus) -> None:
+            if all(device.received for device in status.devices):  # the simulated device draws its pictures first
+                marks.append((time.monotonic(), time.process_time(), link.read()))
 
         folder, manifest = record(
             loaded, out, name=mode, duration_s=duration_s, stop=threading.Event(), on_status=mark,
             on_event=lambda device, event: print(f"  {device}: {event.kind}: {event.text}"),
         )  # fmt: skip
-        ended = (time.process_time(), marks[-1][2])
+        ended_s = time.process_time()
     finally:
         simulated.close()
+    if len(marks) < 2:
+        sys.exit("the simulated device sent no pictures in this time: take a longer --duration, or a machine at rest")
     begin = marks[0]
     elapsed_s = marks[-1][0] - begin[0]
     steady = (marks[-1][1] - begin[1]) - (marks[-1][2] - begin[2])
-    closing_s = ended[0] - marks[-1][1]
-    print(f"  closing the files took {closing_s:.2f} s of CPU")
+    closing_s = ended_s - marks[-1][1]
+    print(f"  {elapsed_s:.0f} s with pictures; closing the files took {closing_s:.2f} s of CPU")
     return folder, manifest, (steady + closing_s) / elapsed_s, (marks[-1][2] - begin[2]) / elapsed_s
 
 
