@@ -16,6 +16,8 @@ from simulated_devices.replay import Playbill
 from simulated_devices.timing import Stage
 from tests.recorder.formats.conftest import write_recording
 
+pytestmark = pytest.mark.timeout(150)  # a busy machine takes long to start, and its takes begin with a backlog
+
 RIGTAPE = [sys.executable, "-m", "recorder.cli"]
 MOST_LATE_NS = 20_000_000  # of stamps after a second way through a machine that may be busy
 
@@ -28,7 +30,7 @@ def recorded_again(take: Path, folder: Path) -> Recording:
         (folder / "replay.yaml").write_text(document)
         command = [*RIGTAPE, "record", str(folder / "replay.yaml"), "-o", str(folder), "--name", "again"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as record:
-            assert replay.wait(40) == 0
+            assert replay.wait(80) == 0
             record.send_signal(signal.SIGINT)
             told, _ = record.communicate(timeout=20)
             assert record.returncode == 0, told
