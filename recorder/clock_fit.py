@@ -233,6 +233,8 @@ def _blend_window(
             usual, unsure = touching_error(low_y - slope_hull * low_x)
             if hides is not None:
                 hidden = hides(slope_hull)
+                if math.isfinite(sd_means):  # a hull that turned with the polls seems to have swept all phases
+                    hidden = max(hidden, hides(slope_means))
             unsteady = 0.0 if hides is not None else _unsteadiness(usual, spread, minutes)
             sd_hull = math.hypot(unsure, hidden.slope_ns, max(unsteady, LEAST_DOUBT) * spread) / span
             if abs(slope_hull - slope_means) > 4 * math.hypot(sd_hull, sd_means):
