@@ -76,25 +76,25 @@ def stamp(packets: np.ndarray, frame: int) -> None:
     packets[:, 16:20] = (ticks % 1_000_000).astype(">u4").view(np.uint8).reshape(-1, 4)
 
 
-def best_s(work: Callable[[], object], rounds: int) -> float:
-    """Of so many rounds: what else runs on the machine only adds to the others."""
+def median_s(work: Callable[[], object], rounds: int) -> float:
+    """CPU time of one round."""
     times = []
     for _ in range(rounds):
         begin = time.thread_time()
         work()
         times.append(time.thread_time() - begin)
-    return min(times)
+    return sorted(times)[len(times) // 2]
 
 
 def decode(rounds: int) -> None:
     for name, packets in (("scene", scene()[1]), ("random", random_frame())):
         result = PointDecoder(M1, compiled=False).decode_packets(packets)
         source, target = result.view(np.uint8), np.empty(result.nbytes, np.uint8)
-        memcpy_s = best_s(lambda: np.copyto(target, source), rounds)  # noqa: B023
+        memcpy_s = median_s(lambda: np.copyto(target, source), rounds)  # noqa: B023
         for compiled in (False, True) if fast.IS_AVAILABLE else (False,):
             decoder = PointDecoder(M1, compiled=compiled)
             decoder.decode_packets(packets)
-            frame_s = best_s(lambda: decoder.decode_packets(packets), rounds)  # noqa: B023
+            frame_s = median_s(lambda: decoder.decode_packets(packets), rounds)  # noqa: B023
             asked = (3.5 if compiled else 0.8) * VENDOR_MILLION_POINTS_S / VENDOR_MEMCPY_MILLION_POINTS_S
             print_line(
                 measure="decode",
