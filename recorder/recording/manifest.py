@@ -56,11 +56,11 @@ class DeviceSummary(msgspec.Struct):
     wrap_bits: int = 0
 
 
-class ClockState(msgspec.Struct):
+class ClockState(msgspec.Struct, omit_defaults=True):
     """A line of raw/clocks.jsonl: one clock as known at a time of the take.
 
     uncertainty_us: one sigma of the stamps given then, apart from the constant least delay of the link, unless that is
-    known: floor_us and floor_bound_us as in ClockSummary.
+    known: floor_us and floor_bound_us as in ClockSummary, left out where they are not.
     """
 
     time: float
