@@ -85,7 +85,7 @@ class LinkCpu:
 
 
 def take(mode: str, source: dict[str, Any], duration_s: float, out: Path) -> tuple[Path, Manifest, float, float]:
-    """Record; gives the folder, the manifest, and the shares of a core (NaN: too short) of recorder and device's thread."""
+    """Record; gives folder, manifest, and the shares of a core of recorder and device's thread (NaN: too short)."""
     path = out / f"{mode}.yaml"
     path.write_text(yaml.safe_dump(source))
     simulated = SimulatedRig(path, ())
