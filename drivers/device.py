@@ -18,6 +18,8 @@ from drivers.samples import DeviceEvent, Received
 ENTRY_POINT_GROUP = "rigtape.drivers"
 RETRY_S = 0.5
 MAX_CAUSES = 8
+SILENCES_KEPT = 10
+"""After so many without a byte in between a link is opened anew: a USB port may have got stuck without a hang-up."""
 
 
 class DeviceError(Exception):
@@ -129,6 +131,7 @@ def received(
     """
     is_present = connected
     told: set[str] = set()  # of one absence: an event for each cause, not for each attempt
+    silences = 0
     try:
         while not stop.is_set():
             try:
@@ -139,9 +142,11 @@ def received(
                     if item.chunks or item.samples:
                         is_present = True
                         told.clear()
+                        silences = 0
                     yield item
             except DeviceError as error:
-                is_kept = keep_silent and isinstance(error, SilentError)
+                silences += isinstance(error, SilentError)
+                is_kept = keep_silent and isinstance(error, SilentError) and silences % SILENCES_KEPT > 0
                 if not is_kept:
                     driver.close()
                 text = str(error)

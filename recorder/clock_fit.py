@@ -43,6 +43,7 @@ GATHERED = 0.3  # spacing of delays below which polls gather them
 WANDER = 1.5  # a step of the mean delay by 1 in the middle of the span turns a line through the means by so much
 DRIFT = 0.1e-6 / S  # change of the skew, per ns: a fast warm-up
 FIRST_WINDOW_S = 20.0  # the window is not cut below this
+MOST_SKEW = 0.05  # no clock is further off; the arrivals of a backlog are
 
 
 class Bucket(NamedTuple):
@@ -223,13 +224,15 @@ def _blend_window(
     weight = [1 / prior.sigma**2]
     slopes = [prior.slope]
     slope_means, sd_means, scatter = mean_slope(mean_x, mean_y, sd_mean)
+    if abs(slope_means) >= MOST_SKEW:
+        sd_means = math.inf
     if math.isfinite(sd_means):
         white = 1.5 * float(np.median(sd_mean))
         sd_means = math.hypot(sd_means, (0.02 * spread + WANDER * wander) / span) * (1 + minutes**1.25)
         wander = max(wander, math.sqrt(max(scatter**2 - white**2, 0.0)))
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
-        if length > 0:
+        if length > 0 and abs(slope_hull) < MOST_SKEW:
             usual, unsure = touching_error(low_y - slope_hull * low_x)
             if hides is not None:
                 hidden = hides(slope_hull)

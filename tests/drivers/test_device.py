@@ -150,6 +150,19 @@ def test_a_link_that_was_only_silent_stays_open(run: Run) -> None:
     assert driver.calls == ["read", "connect", "read", "close"]
 
 
+def test_a_link_that_stays_silent_for_long_is_opened_anew(run: Run) -> None:
+    _, driver = run([data(1), SILENT], *[[SILENT]] * device.SILENCES_KEPT, [data(2), STOP], connected=True)
+    assert driver.calls == [
+        "read",
+        *["connect"] * (device.SILENCES_KEPT - 1),
+        "close",
+        "connect",
+        "connect",
+        "read",
+        "close",
+    ]
+
+
 def test_ever_new_causes_do_not_fill_the_log(run: Run) -> None:
     items, _ = run([data(1), GONE], *[[DeviceError(f"{number} bytes came")] for number in range(1000)], [STOP])
     assert len(events(items)) <= device.MAX_CAUSES + 2

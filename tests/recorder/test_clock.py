@@ -250,6 +250,18 @@ def test_stall_is_no_restart() -> None:
     assert (clock.epoch, clock.late > 0) == (0, True)
 
 
+@pytest.mark.parametrize("rate_hz", [10.0, 400.0])
+@pytest.mark.parametrize("backlog_s", [1.5, 5.0])
+def test_backlog_at_the_start_is_no_clock_rate(rate_hz: float, backlog_s: float) -> None:
+    t = trace(duration_s=30.0, rate_hz=rate_hz)
+    t.arrival_ns = np.maximum(t.arrival_ns, BOOT_NS + int(backlog_s * 1e9) + np.arange(t.ticks.size) * 1000)
+    clock = ClockMap(1e6)
+    stamps_ns = t.mapped(clock)
+    assert_causal(stamps_ns, t)
+    assert rms_us(stamps_ns, t) < 400
+    assert clock.epoch == 0
+
+
 def jumped(t: Trace, at_s: float, by_s: float) -> Trace:
     after = t.true_ns >= BOOT_NS + int(at_s * 1e9)
     return Trace(t.true_ns, t.ticks + np.where(after, int(by_s * 1e6), 0), t.arrival_ns)
