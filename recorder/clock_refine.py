@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_fit import LEVEL, Floats, Level, SlopePrior, hull_slope, touching_error
+from recorder.clock_fit import LEVEL, MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
 from recorder.clock_grid import LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
 from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
 
@@ -37,6 +37,7 @@ LOWEST = 1.0  # of the median delay by the root of their number: how late the qu
 GAP_SIGMA = 0.5  # of the gap between the samples' phases that may hide the floor
 LAW_ERROR = 0.008  # of the mean delay times the law's shape, times the shape again but at least 2: see docs/clocks.md
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
+NOMINAL = SlopePrior(0.0, 100 * PPM)  # where most of an epoch came as a backlog
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +146,8 @@ def stays_clear(curve: Curve, x: Floats, y: Floats, limit_ns: float) -> bool:
 def envelope_by_data(x: Floats, y: Floats, prior: SlopePrior | None = None) -> Curve:
     """The envelope of one sync epoch with as many knots as the data ask for."""
     slope = hull_slope(*lowest_points(x, y, 0.0))[0] if x[-1] - x[0] > MIN_SPAN_S * S else 0.0
+    if prior is None and abs(slope) >= MOST_SKEW:
+        prior = NOMINAL
     if prior is not None:
         slope = prior.slope
     low_x, low_y = lowest_points(x, y, slope)

@@ -251,15 +251,16 @@ def test_stall_is_no_restart() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 400.0])
-@pytest.mark.parametrize("backlog_s", [1.5, 5.0])
+@pytest.mark.parametrize("backlog_s", [1.5, 5.0, 20.0])
 def test_backlog_at_the_start_is_no_clock_rate(rate_hz: float, backlog_s: float) -> None:
-    t = trace(duration_s=30.0, rate_hz=rate_hz)
+    t = trace(duration_s=40.0, rate_hz=rate_hz)
     t.arrival_ns = np.maximum(t.arrival_ns, BOOT_NS + int(backlog_s * 1e9) + np.arange(t.ticks.size) * 1000)
     clock = ClockMap(1e6)
     stamps_ns = t.mapped(clock)
     assert_causal(stamps_ns, t)
-    assert rms_us(stamps_ns, t) < 400
+    assert rms_us(stamps_ns, t, backlog_s + 5) < 400
     assert clock.epoch == 0
+    assert rms_us(refine(t.ticks, t.arrival_ns, 1e6), t, 0.0) < 1000
 
 
 def jumped(t: Trace, at_s: float, by_s: float) -> Trace:
