@@ -27,6 +27,7 @@ KNOT_S = (150.0, 75.0, 37.5)
 MIN_SPAN_S = 1.0  # the slope of a shorter epoch is taken as nominal
 CLEAR = 0.15  # of the spread: a third of a piece further than this above the curve asks for more knots
 GRID_KNOT_S = 20.0
+MIN_POLLED = 0.5  # share of the seconds in which polls are seen, for them to count
 GRID_CURVATURE = 0.02e-6 / S
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
 ROUNDS = 4
@@ -175,13 +176,20 @@ def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], f
     for part in np.split(arrival, cuts):
         if part.size:
             tracker.feed(part)
-    if not tracker.period_ns:
+    period = tracker.period_ns
+    if not period:
         return [], 0.0, 0.0
-    tracker = tracker.rewound(arrival[:CHUNK_ARRIVALS])
+    follower = tracker.rewound(arrival[:CHUNK_ARRIVALS])
     cuts = np.searchsorted(x, np.arange(x[0] + S, x[-1], S))
-    parts = zip(np.split(x, cuts), np.split(y, cuts), strict=True)
-    points = [snap(part_x, part_y, slope, tracker) for part_x, part_y in parts if part_x.size]
-    return [p for p in points if p is not None], tracker.period_ns, tracker.period_ns * (1 + tracker.frequency)
+    parts = [part for part in zip(np.split(x, cuts), np.split(y, cuts), strict=True) if part[0].size]
+    points: list[GridPoints] = []
+    for part_x, part_y in parts:
+        found = snap(part_x, part_y, slope, follower)
+        if found is not None and follower.period_ns == period:  # else the polls got lost, and others were found
+            points.append(found)
+    if len(points) < MIN_POLLED * len(parts):
+        return [], 0.0, 0.0
+    return points, period, period * (1 + tracker.frequency)
 
 
 def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -> tuple[Curve, float, float] | None:

@@ -29,6 +29,7 @@ CHUNK_ROWS = 1 << 18
 FAST_HZ = 1500.0
 THIN_NS = 1_000_000  # of a fast stream the least delayed message of so long is kept: memory for hours
 SAME_ZERO_NS = 1_000_000_000
+COMPARED_NS = 10_000_000_000
 JUMP_NS = 2_000_000  # from one message to the next: the device's clock was set, or this is garbage
 JUMP_SHARE = 500e-6  # and what a clock may gain meanwhile
 STEP_BACK_NS = 1_000_000_000  # less is reordering
@@ -152,8 +153,8 @@ def _put_on_axis(table: DeviceTable, axes: dict[str, Ints], other: DeviceTable) 
     mine, theirs = axes[table.device], axes[other.device]
     if not mine.size or not theirs.size:
         return True
-    near = min(int(np.searchsorted(other.heard[:, 1], table.heard[0, 1])), theirs.size - 1)
-    apart_ns = int(mine[0] - table.heard[0, 1] - theirs[near] + other.heard[near, 1])
+    both_from_ns = int(max(table.heard[0, 1], other.heard[0, 1]))
+    apart_ns = _lead_ns(mine, table.heard[:, 1], both_from_ns) - _lead_ns(theirs, other.heard[:, 1], both_from_ns)
     for wrapping in (table, other):
         if wrapping.wrap_bits:
             wrap_ns = round((1 << wrapping.wrap_bits) * NS_PER_S / wrapping.tick_hz)
@@ -161,6 +162,13 @@ def _put_on_axis(table: DeviceTable, axes: dict[str, Ints], other: DeviceTable) 
             axes[table.device] = axes[table.device] - turns * wrap_ns
             apart_ns -= turns * wrap_ns
     return abs(apart_ns) < SAME_ZERO_NS
+
+
+def _lead_ns(axis: Ints, arrival_ns: Ints, from_ns: int) -> int:
+    """How far a device's time is ahead of the arrivals, by the quickest of some seconds: a backlog may come first."""
+    first = min(int(np.searchsorted(arrival_ns, from_ns)), axis.size - 1)
+    end = max(int(np.searchsorted(arrival_ns, from_ns + COMPARED_NS)), first + 1)
+    return int((axis[first:end] - arrival_ns[first:end]).max())
 
 
 def _refine_group(group: list[DeviceTable], axes: dict[str, Ints], start_ns: int, level: Level) -> Refined:

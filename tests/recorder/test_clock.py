@@ -161,6 +161,14 @@ def test_a_controllers_polls_are_known_from_another_device(poll_ms: float) -> No
         assert (shared == alone).all()
 
 
+@pytest.mark.parametrize("until_s", [1.6, 1.8, 2.2])
+def test_polls_that_come_to_an_end_are_forgotten(until_s: float) -> None:
+    polled, free = (trace(seed=3, rate_hz=400.0, duration_s=10.0, poll_ms=poll_ms) for poll_ms in (1.0, 0.0))
+    is_polled = polled.true_ns < BOOT_NS + int(until_s * 1e9)
+    free.arrival_ns = np.maximum.accumulate(np.where(is_polled, polled.arrival_ns, free.arrival_ns))
+    assert rms_us(refine(free.ticks, free.arrival_ns, 1e6), free, 0.0) < 50
+
+
 def test_a_devices_own_rhythm_is_no_polling_grid() -> None:
     t = trace(rate_hz=100.0, jitter_ms=0.2, duration_s=40.0)
     assert (t.mapped(ClockMap(1e6)) == t.mapped(ClockMap(1e6, use_grid=False))).mean() > 0.9

@@ -68,6 +68,19 @@ def test_a_device_that_is_held_up_does_not_disturb_the_other(tmp_path):
         assert np.abs(errors_us(refined, device, taken_ns)).max() < 150, device
 
 
+def test_what_two_devices_sent_before_they_were_read_does_not_part_them(tmp_path):
+    taken_ns = every(50 * MS, 30)
+    waited_ns = np.maximum(0, 3 * S - taken_ns)
+    names = ("a", "b")
+    tables = [
+        table(tmp_path, name, taken_ns, late_ns=waited_ns + seed * 3 * MS * (waited_ns > 0), seed=seed)
+        for seed, name in enumerate(names)
+    ]
+    (refined,) = refine_tables(tables, START_NS)
+    for device in names:
+        assert np.abs(errors_us(refined, device, taken_ns)).max() < 250, device
+
+
 def test_a_restart_of_the_clock_that_two_devices_share(tmp_path):
     taken_ns = every(5 * MS, 40)
     taken_ns = taken_ns[(taken_ns < 20 * S) | (taken_ns > 22 * S)]
