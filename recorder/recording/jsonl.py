@@ -30,17 +30,18 @@ QUEUE_BYTES = 64 << 20
 LINE_BYTES = 300
 MILLIMETRE_M = 0.001
 
-encode_json = msgspec.json.Encoder().encode
+_encoder = msgspec.json.Encoder()
+encode_json, encode_lines = _encoder.encode, _encoder.encode_lines
 
 
-class SensorValues(msgspec.Struct):
+class SensorValues(msgspec.Struct, gc=False):
     """Body of a sensor line."""
 
     type: str
     values: tuple[float, ...]
 
 
-class SensorLine(msgspec.Struct):
+class SensorLine(msgspec.Struct, gc=False):
     """One reading of one sensor: m/s², rad/s, µT or K."""
 
     sensor: SensorValues
@@ -106,7 +107,7 @@ class PendingFrames:
 
 @dataclass(frozen=True, slots=True)
 class PendingScan:
-    """A lidar line to be, written when its file is whole."""
+    """A lidar line to be, written when its file is whole. line: with its end."""
 
     ticket: Ticket
     line: bytes
@@ -115,21 +116,20 @@ class PendingScan:
 Pending = bytes | PendingFrames | PendingScan
 
 
-def imu_lines(time_ns: int, sample: ImuSample) -> list[tuple[str, bytes]]:
-    """Name and line of each sensor of an IMU sample, accelerometer first; none when a value is not a number."""
+def imu_lines(time_ns: int, sample: ImuSample) -> tuple[list[SensorLine], bytes]:
+    """A line for each sensor of an IMU sample, accelerometer first, and their text; none when a value is no number."""
     time_s = time_ns / NS_PER_S
-    sensors = (
-        ("accelerometer", sample.accel_m_s2),
-        ("gyroscope", sample.gyro_rad_s),
-        ("magnetometer", sample.mag_ut),
-        ("imuTemperature", None if sample.temperature_k is None else (sample.temperature_k,)),
-    )
-    lines = [
-        (kind, encode_json(SensorLine(SensorValues(kind, values), time_s)))
-        for kind, values in sensors
-        if values is not None
-    ]
-    return [] if any(b"null" in line for _, line in lines) else lines  # what is not finite becomes null
+    lines = []
+    if sample.accel_m_s2 is not None:
+        lines.append(SensorLine(SensorValues("accelerometer", sample.accel_m_s2), time_s))
+    if sample.gyro_rad_s is not None:
+        lines.append(SensorLine(SensorValues("gyroscope", sample.gyro_rad_s), time_s))
+    if sample.mag_ut is not None:
+        lines.append(SensorLine(SensorValues("magnetometer", sample.mag_ut), time_s))
+    if sample.temperature_k is not None:
+        lines.append(SensorLine(SensorValues("imuTemperature", (sample.temperature_k,)), time_s))
+    text = encode_lines(lines)
+    return ([], b"") if b"null" in text else (lines, text)  # what is not finite becomes null
 
 
 def fix_line(time_ns: int, fix: FixSample) -> bytes | None:
@@ -155,7 +155,7 @@ def fix_line(time_ns: int, fix: FixSample) -> bytes | None:
     if not all(map(math.isfinite, gps.values())):
         return None
     known = {key: value for key, value in details.items() if _is_known(value)}
-    return encode_json({"gps": gps, "fix": known, "time": time_ns / NS_PER_S})
+    return encode_lines([{"gps": gps, "fix": known, "time": time_ns / NS_PER_S}])
 
 
 def _is_known(value: object) -> bool:
@@ -169,7 +169,7 @@ def pose_line(time_ns: int, name: str, pose: PoseSample) -> bytes | None:
     body: dict[str, object] = {"position": dict(zip("xyz", pose.position_m, strict=True))}
     if pose.orientation_wxyz is not None:
         body["orientation"] = dict(zip("wxyz", pose.orientation_wxyz, strict=True))
-    return encode_json({name: body, "time": time_ns / NS_PER_S})
+    return encode_lines([{name: body, "time": time_ns / NS_PER_S}])
 
 
 def lidar_line(time_ns: int, model: str, data_file: str, scan: ScanSample) -> bytes:
@@ -186,7 +186,7 @@ def lidar_line(time_ns: int, model: str, data_file: str, scan: ScanSample) -> by
         del lidar["pointsExpected"]
     if scan.is_partial:
         lidar["partial"] = True
-    return encode_json({"lidar": lidar, "time": time_ns / NS_PER_S})
+    return encode_lines([{"lidar": lidar, "time": time_ns / NS_PER_S}])
 
 
 class LineWriter:
@@ -204,7 +204,7 @@ class LineWriter:
         self._thread = start_thread("jsonl", self._run, self._failed)
 
     def put(self, line: Pending, *, late: bool = False) -> None:
-        """Take the next line, or lines; waits when the disk is far behind."""
+        """Take the next line, or lines, with their ends; waits when the disk is far behind."""
         self._queue.put((line, late), len(line) if isinstance(line, bytes) else LINE_BYTES)
 
     def _run(self) -> None:
@@ -229,7 +229,7 @@ class LineWriter:
             pending, late = waiting.popleft()
             line = self._finished(pending)
             if line is not None:
-                (late_lines if late else lines).append(line + b"\n")
+                (late_lines if late else lines).append(line)
         if lines:
             self._write(self._file, lines)
         if late_lines:
@@ -254,7 +254,7 @@ class LineWriter:
         first = cameras[0]
         number = self._numbers[first]
         self._numbers[first] += 1
-        return encode_json((ExtraFramesLine if first else FramesLine)(entries, number, time_s))
+        return encode_lines([(ExtraFramesLine if first else FramesLine)(entries, number, time_s)])
 
     def _failed(self, name: str, error: Exception) -> None:
         """Nothing can be written any more: empty the queue, so that nobody waits for room."""
@@ -299,7 +299,7 @@ def merge_late_lines(folder: Path) -> FileEntry:
     numbers: Counter[int] = Counter()
     for line in joined_frames(_merged(_decoded_lines(data_path), iter(late))):
         number_frames(line, numbers)
-        merged.write(encode_json(line) + b"\n")
+        merged.write(encode_lines([line]))
     entry = merged.close()
     merged_path.replace(data_path)
     late_path.unlink()

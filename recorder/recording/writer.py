@@ -116,13 +116,13 @@ class RecordingWriter:
 
     def write_imu(self, device: str, time_ns: int, sample: ImuSample, *, late: bool = False) -> bool:
         """One line per sensor of the sample, counted for its device; False when a value is not a number."""
-        lines = imu_lines(time_ns, sample)
+        lines, text = imu_lines(time_ns, sample)
         if not lines:
             return False
         counts = self.manifest.devices[device].stream.sensor_lines
-        for sensor, _ in lines:
-            counts[sensor] = counts.get(sensor, 0) + 1
-        self._lines.put(b"\n".join([line for _, line in lines]), late=late)
+        for line in lines:
+            counts[line.sensor.type] = counts.get(line.sensor.type, 0) + 1
+        self._lines.put(text, late=late)
         return True
 
     def write_fix(self, time_ns: int, fix: FixSample, *, late: bool = False) -> bool:

@@ -57,7 +57,7 @@ def frames(time_ns: int, *states: str | None) -> PendingFrames:
 
 
 def plain(time_ns: int) -> bytes:
-    return imu_lines(time_ns, ImuSample(None, None, (0.0, 0.0, 9.81), None))[0][1]
+    return imu_lines(time_ns, ImuSample(None, None, (0.0, 0.0, 9.81), None))[1]
 
 
 class Writer(LineWriter):
@@ -71,7 +71,7 @@ class Writer(LineWriter):
 
 def test_one_line_for_each_sensor_accelerometer_first():
     sample = ImuSample(7, 1, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0), 300.5)
-    assert [json.loads(line) for _, line in imu_lines(1_234_567_891, sample)] == [
+    assert [json.loads(line) for line in imu_lines(1_234_567_891, sample)[1].splitlines()] == [
         {"sensor": {"type": "accelerometer", "values": [1.0, 2.0, 3.0]}, "time": 1.234567891},
         {"sensor": {"type": "gyroscope", "values": [4.0, 5.0, 6.0]}, "time": 1.234567891},
         {"sensor": {"type": "magnetometer", "values": [7.0, 8.0, 9.0]}, "time": 1.234567891},
@@ -80,8 +80,8 @@ def test_one_line_for_each_sensor_accelerometer_first():
 
 
 def test_a_sample_lists_only_what_it_carries():
-    ((sensor, line),) = imu_lines(0, ImuSample(None, None, None, (0.0, 0.0, 1.0)))
-    assert sensor == json.loads(line)["sensor"]["type"] == "gyroscope"
+    (line,), text = imu_lines(0, ImuSample(None, None, None, (0.0, 0.0, 1.0)))
+    assert line.sensor.type == json.loads(text)["sensor"]["type"] == "gyroscope"
 
 
 def test_fix_has_the_formats_keys_and_no_null():
@@ -118,8 +118,8 @@ def test_pose_goes_under_its_name():
 
 def test_what_is_not_a_number_gets_no_line():
     """JSON has no NaN: it would be written as null, which readers trip over."""
-    assert imu_lines(0, ImuSample(0, 0, (0.0, NAN, 0.0), (0.0, 0.0, 0.0))) == []
-    assert imu_lines(0, ImuSample(0, 0, None, (0.0, 0.0, 0.0), None, NAN)) == []
+    assert imu_lines(0, ImuSample(0, 0, (0.0, NAN, 0.0), (0.0, 0.0, 0.0)))[0] == []
+    assert imu_lines(0, ImuSample(0, 0, None, (0.0, 0.0, 0.0), None, NAN))[0] == []
     assert pose_line(0, "mocap", PoseSample(0, 0, (0.0, 0.0, NAN), None)) is None
     assert pose_line(0, "mocap", PoseSample(0, 0, (0.0, 0.0, 0.0), (NAN, 0.0, 0.0, 0.0))) is None
     assert fix_line(0, replace(FIX, latitude_deg=NAN)) is None
@@ -338,7 +338,7 @@ def test_full_disk_at_the_merge_keeps_what_was_written(tmp_path, files_limited_t
     for line in in_time:
         writer.put(line)
     writer.put(plain(0), late=True)
-    with files_limited_to(sum(len(line) + 1 for line in in_time)), pytest.raises(OSError, match="File too large"):
+    with files_limited_to(sum(map(len, in_time))), pytest.raises(OSError, match="File too large"):
         writer.close()
     assert len(read_lines(tmp_path)) == 1000
     assert len(read_lines(tmp_path, "late.jsonl")) == 1
