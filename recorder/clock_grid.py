@@ -25,7 +25,7 @@ from recorder.clock_fit import Floats
 Ints = NDArray[np.int64]
 
 S = 1e9  # ns
-PERIODS_NS = (16e6, 10e6, 8e6, 4e6, 2e6, 1e6, 0.5e6, 0.25e6, 0.125e6)
+PERIODS_NS = np.array([16e6, 10e6, 8e6, 4e6, 2e6, 1e6, 0.5e6, 0.25e6, 0.125e6])
 CHUNK = 20  # arrivals whose phases are averaged when looking for a period
 CHUNKS = 8
 FORGET = 0.97
@@ -251,7 +251,7 @@ class GridTracker:
 
     def _forget(self) -> None:
         self.period_ns = 0.0
-        self._power = np.zeros(len(PERIODS_NS))
+        self._power = np.zeros(PERIODS_NS.size)
         self._chunks = 0
         self._recent = np.empty(0)
         self._edge = 0.0  # time of a poll
@@ -319,18 +319,13 @@ class GridTracker:
         seen = np.concatenate([self._recent, fresh])
         if self._adopt(seen):
             return
-        new = (fresh.size + self._recent.size % CHUNK) // CHUNK
-        periods = np.array(PERIODS_NS)
-        for i in range(new):
-            end = seen.size - (seen.size % CHUNK) - (new - 1 - i) * CHUNK
-            chunk = seen[max(end - CHUNK, 0) : end]
-            if chunk.size < CHUNK:
-                continue
-            phasor = np.exp(2j * np.pi * ((chunk[:, None] % periods) / periods)).mean(axis=0)
-            phasor[periods > 0.5 * (chunk[-1] - chunk[0])] = 0.0  # too short a look
-            power = (CHUNK * np.abs(phasor) ** 2 - 1) / (CHUNK - 1)
+        new, end = (fresh.size + self._recent.size % CHUNK) // CHUNK, seen.size // CHUNK * CHUNK
+        chunks = seen[end - new * CHUNK : end].reshape(new, CHUNK)
+        phasors = np.exp(2j * np.pi * ((chunks[:, :, None] % PERIODS_NS) / PERIODS_NS)).mean(axis=1)
+        phasors[PERIODS_NS > 0.5 * (chunks[:, -1:] - chunks[:, :1])] = 0.0  # too short a look
+        for power in (CHUNK * np.abs(phasors) ** 2 - 1) / (CHUNK - 1):
             self._power = FORGET * self._power + (1 - FORGET) * power
-            self._chunks += 1
+        self._chunks += new
         keep = CHUNK * CHUNKS + seen.size % CHUNK
         self._recent = seen[-keep:]
         if self._chunks >= CHUNKS:
@@ -339,7 +334,7 @@ class GridTracker:
     def _choose(self, candidates: NDArray[np.bool_]) -> None:
         """Of the candidates the longest period whose arrivals are within twice the sharpest one's of its polls."""
         found: list[tuple[float, float, float]] = []
-        for period in np.array(PERIODS_NS)[candidates]:
+        for period in PERIODS_NS[candidates]:
             last = self._recent[-3 * CHUNK :]
             phase = np.angle(np.exp(2j * np.pi * ((last % period) / period)).mean()) / (2 * np.pi) * period
             rest = (last - phase + period / 2) % period - period / 2
@@ -399,13 +394,13 @@ class GridTracker:
 
 def snap(x: Floats, y: Floats, slope: float, tracker: GridTracker) -> GridPoints | None:
     """One bucket's samples on their polls, or nothing without a grid."""
-    spread = float(np.subtract(*np.quantile(y - slope * x, (0.75, 0.1))))
     order = np.argsort(x + y, kind="stable")
-    x, arrival = x[order], (x + y)[order]
+    x, y, arrival = x[order], y[order], (x + y)[order]
     followed = tracker.feed(arrival)
     if followed is None or not tracker.period_ns or not followed[1].any():
         return None
     polls, on_grid, index, jitter = followed
+    spread = float(np.subtract(*np.quantile(y - slope * x, (0.75, 0.1))))
     x, index = x[on_grid], index[on_grid]
     y = polls[on_grid] - x
     events_x = x[:: x.size // EVENTS + 1]
