@@ -322,7 +322,7 @@ class GridTracker:
         new, end = (fresh.size + self._recent.size % CHUNK) // CHUNK, seen.size // CHUNK * CHUNK
         chunks = seen[end - new * CHUNK : end].reshape(new, CHUNK)
         phasors = np.exp(2j * np.pi * ((chunks[:, :, None] % PERIODS_NS) / PERIODS_NS)).mean(axis=1)
-        phasors[PERIODS_NS > 0.5 * (chunks[:, -1:] - chunks[:, :1])] = 0.0  # too short a look
+        phasors[0.5 * (chunks[:, -1:] - chunks[:, :1]) < PERIODS_NS] = 0.0  # too short a look
         for power in (CHUNK * np.abs(phasors) ** 2 - 1) / (CHUNK - 1):
             self._power = FORGET * self._power + (1 - FORGET) * power
         self._chunks += new

@@ -179,7 +179,7 @@ class RawWriter:
         """Take what one read brought; never waits."""
         if not self._tape or not chunks:
             return
-        size = chunks.data.nbytes if isinstance(chunks, Datagrams) else sum(len(chunk.data) for chunk in chunks)
+        size = chunks.data.nbytes if isinstance(chunks, Datagrams) else sum([len(chunk.data) for chunk in chunks])
         if not self._queue.offer((device, chunks), size + 64 * len(chunks)):
             self.dropped_bytes[device] = self.dropped_bytes.get(device, 0) + size
 

@@ -8,7 +8,6 @@ import contextlib
 import hashlib
 import os
 import threading
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -42,7 +41,7 @@ class ByteQueue(Generic[T]):
     def __init__(self, limit_bytes: int) -> None:
         """Empty and open."""
         self._limit = limit_bytes
-        self._items: deque[tuple[T, int]] = deque()
+        self._items: list[T] = []
         self._bytes = 0
         self._closed = False
         self._lock = threading.Lock()
@@ -76,7 +75,7 @@ class ByteQueue(Generic[T]):
     def _append(self, item: T, size: int) -> None:
         if not self._items:  # else the consumer does not wait
             self._changed.notify_all()
-        self._items.append((item, size))
+        self._items.append(item)
         self._bytes += size
 
     def get_all(self, timeout_s: float) -> list[T]:
@@ -84,9 +83,7 @@ class ByteQueue(Generic[T]):
         with self._lock:
             if not self._items and not self._closed:
                 self._changed.wait(timeout_s)
-            items = [item for item, _ in self._items]
-            self._items.clear()
-            self._bytes = 0
+            items, self._items, self._bytes = self._items, [], 0
             self._changed.notify_all()
             return items
 
