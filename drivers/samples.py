@@ -100,7 +100,7 @@ class FrameSample:
     """
 
     device_ticks: int
-    packet: bytes
+    packet: bytes | memoryview
     is_keyframe: bool
     video: VideoFormat
     exposure_s: float | None

@@ -169,8 +169,11 @@ def _before_picture(codec: str, packet: bytes) -> bytes:
     return b""
 
 
-def _raw_picture(message: Message, fps: float) -> tuple[VideoFormat, bytes, str]:
-    """A raw picture without the padding of its rows, and what is wrong with it, if anything."""
+def _raw_picture(message: Message, fps: float) -> tuple[VideoFormat, bytes | memoryview, str]:
+    """A raw picture without the padding of its rows, and what is wrong with it, if anything.
+
+    Where there is no padding it is the message's own memory, which nobody writes to any more: it is not copied.
+    """
     width, height, stride = message.getWidth(), message.getHeight(), message.getStride() or message.getWidth()
     name = message.getType().name
     pixels, bytes_per_pixel = RAW_PIXELS.get(name, ("", 0.0))
@@ -183,7 +186,7 @@ def _raw_picture(message: Message, fps: float) -> tuple[VideoFormat, bytes, str]
         return video, b"", f"{data.size} bytes are no {name} picture of {width}x{height}"
     if stride != width:
         return video, np.ascontiguousarray(data[: stride * rows].reshape(rows, stride)[:, :width]).tobytes(), ""
-    return video, data[: width * rows].tobytes(), ""
+    return video, data[: width * rows].data, ""
 
 
 @dataclass(slots=True)

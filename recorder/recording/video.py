@@ -124,7 +124,7 @@ class VideoWriter:
                 if self._encoder is not None:
                     self._encode(self._file, self._encoder.frame(frame), self._time_ms(time_ns), ticket)
                 else:
-                    self._mux(self._file, frame.packet, self._time_ms(time_ns), frame.is_keyframe, ticket)
+                    self._mux(self._file, bytes(frame.packet), self._time_ms(time_ns), frame.is_keyframe, ticket)
                 return
             except PictureError as error:
                 cause = str(error)
@@ -150,7 +150,7 @@ class VideoWriter:
             return "pictures up to the next key frame are left out too"
         if frame.video.codec != RAW:
             self._packets = self._packets or PacketCheck(frame.video.codec)
-            if fault := self._packets.fault(frame.packet):
+            if fault := self._packets.fault(bytes(frame.packet)):
                 self._wait_for_keyframe = True
                 return fault
         self._wait_for_keyframe = False

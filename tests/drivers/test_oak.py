@@ -247,6 +247,17 @@ def test_raw_pictures_are_packed_tightly():
     assert (nv12.video.pixel_format, len(nv12.packet)) == ("nv12", 64 * 6)
 
 
+def test_raw_pictures_outlive_their_messages():
+    decoder = PictureDecoder("left", 0, 30.0)
+    pictures = [np.full(64 * 4, number, np.uint8) for number in range(100)]
+    held = []
+    for number, picture in enumerate(pictures):
+        message = raw(number)
+        message.setData(picture)
+        held += samples([decoder.feed(0, message)])
+    assert [sample.packet for sample in held] == [picture.tobytes() for picture in pictures]
+
+
 @pytest.mark.parametrize(
     "message",
     [raw(0, rows=3), raw(0, kind=dai.ImgFrame.Type.RGB888i), raw(0, stride=32, rows=8), dai.ImgFrame(), dai.Buffer()],
