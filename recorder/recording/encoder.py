@@ -5,6 +5,7 @@ format that it names. Depth (gray16le) is always FFV1, as nothing else keeps its
 reorder pictures for longer than it must: no B-frames, one thread, no look-ahead.
 """
 
+import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Annotated, Any, Literal, get_args
@@ -99,7 +100,9 @@ class Encoder:
         """The picture as the encoder takes it. Raises PictureError."""
         video = sample.video
         planes = _planes(sample)
-        if video.pixel_format == "gray" and self.pixel_format != "gray":
+        if video.pixel_format == self.pixel_format == "gray":
+            frame = VideoFrame.from_numpy_buffer(planes, format="gray")  # no copy: encoders make their own
+        elif video.pixel_format == "gray":
             frame = _gray_with_chroma(planes, self.pixel_format)
         else:
             frame = VideoFrame.from_ndarray(planes, format=video.pixel_format)
@@ -165,23 +168,23 @@ def _hardware(settings: VideoSettings) -> Encoder:
 
 
 _BYTE, _WORD = np.dtype(np.uint8), np.dtype("<u2")
-# By pixel format: rows of the array for a row of the picture, values for a pixel in a row (0: one), and their type.
-_SHAPES: dict[str, tuple[Fraction, int, np.dtype[Any]]] = {
-    "gray": (Fraction(1), 0, _BYTE),
-    "gray16le": (Fraction(1), 0, _WORD),
-    "nv12": (Fraction(3, 2), 0, _BYTE),
-    "yuv420p": (Fraction(3, 2), 0, _BYTE),
-    "yuyv422": (Fraction(1), 2, _BYTE),
-    "bgr24": (Fraction(1), 3, _BYTE),
-    "rgb24": (Fraction(1), 3, _BYTE),
+# By pixel format: rows of the array for two of the picture, values for a pixel in a row (0: one), and their type.
+_SHAPES: dict[str, tuple[int, int, np.dtype[Any]]] = {
+    "gray": (2, 0, _BYTE),
+    "gray16le": (2, 0, _WORD),
+    "nv12": (3, 0, _BYTE),
+    "yuv420p": (3, 0, _BYTE),
+    "yuyv422": (2, 2, _BYTE),
+    "bgr24": (2, 3, _BYTE),
+    "rgb24": (2, 3, _BYTE),
 }
 
 
 def _planes(sample: FrameSample) -> Planes:
     video = sample.video
     rows, channels, dtype = _SHAPES[video.pixel_format]
-    shape = [int(video.height * rows), video.width] + ([channels] if channels else [])
-    expected_bytes = int(np.prod(shape)) * dtype.itemsize
+    shape = [video.height * rows // 2, video.width] + ([channels] if channels else [])
+    expected_bytes = math.prod(shape) * dtype.itemsize
     if len(sample.packet) != expected_bytes:
         raise PictureError(
             f"a picture of {len(sample.packet)} bytes, {video.width}x{video.height} {video.pixel_format} "
