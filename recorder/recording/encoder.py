@@ -150,7 +150,8 @@ def _candidates(settings: VideoSettings, video: VideoFormat) -> list[Encoder]:
 
 def _x264(**quality: str) -> dict[str, str]:
     common = {"preset": "ultrafast", "tune": "zerolatency", "g": KEYFRAME_EVERY, "bf": "0"}
-    return common | quality | {"x264-params": "log-level=error"}
+    # To look for blocks with so little in them that it may be left out costs more time than to write them.
+    return common | quality | {"x264-params": "log-level=error:no-dct-decimate=1"}
 
 
 def _hardware(settings: VideoSettings) -> Encoder:
