@@ -161,7 +161,9 @@ class TwoWayPair:
     not_after_ns: int
 
 
-Sample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample | ClockPairs | TwoWayPair
+EventSample: TypeAlias = ImuSample | FixSample | PoseSample | FrameSample | LostFrame | ScanSample
+Sample: TypeAlias = EventSample | ClockPairs | TwoWayPair
+"""What has a time of its own, and what only tells of clocks."""
 
 
 class Chunk(Struct, frozen=True, gc=False):

@@ -74,7 +74,7 @@ class _ClockTable:
         if isinstance(sample, ScanSample):
             if stamped.scan_knots is not None:
                 self.batches.append(scan_rows(stamped.scan_knots - np.array([0, start_ns]), time_ns))
-        elif not isinstance(sample, ClockPairs) and sample.device_ticks is not None:
+        elif sample.device_ticks is not None:
             self.rows.append((sample.device_ticks, stamped.arrival_ns, time_ns))
 
     def taken(self) -> list[npt.NDArray[np.int64]]:
@@ -149,16 +149,17 @@ class Pipeline:
         if controller is not None:
             self._timebase.polled_by(device, controller)
 
-    def take(self, device: str, arrival_ns: int, sample: Sample) -> None:
-        """Feed one sample with its arrival on the host's monotonic clock."""
+    def take(self, name: str, arrival_ns: int, sample: Sample) -> None:
+        """Feed one sample of a device with its arrival on the host's monotonic clock."""
+        device = self._devices[name]
         if isinstance(sample, ClockPairs):
             none = np.full(sample.ticks.size, NONE, np.int64)
-            self._judge_clock(device, sample)
-            self._tables[device].batches.append(np.column_stack((sample.ticks, sample.arrival_ns, none)))
+            self._judge_clock(name, sample)
+            self._tables[name].batches.append(np.column_stack((sample.ticks, sample.arrival_ns, none)))
         elif not isinstance(sample, TwoWayPair):
-            self._devices[device].summary.received += 1
-        self._heard.add(self._devices[device].clock)
-        self._timebase.take(device, arrival_ns, sample)
+            device.summary.received += 1
+        self._heard.add(device.clock)
+        self._timebase.take(name, arrival_ns, sample)
 
     def _judge_clock(self, name: str, pairs: ClockPairs) -> None:
         """Say once in each sync epoch which time a device that sends packets of its own time shows."""
@@ -189,13 +190,14 @@ class Pipeline:
         device = self._devices[stamped.device]
         device.last_host_ns = stamped.host_ns
         time_ns = stamped.host_ns - self._start_ns
-        if isinstance(stamped.sample, (FrameSample, LostFrame)):  # a union would be made anew for each sample
-            line_ns = self._place_picture(device, time_ns, stamped.device_ns, stamped.sample)
-            self._tables[stamped.device].rows.append((stamped.sample.device_ticks, stamped.arrival_ns, line_ns))
+        sample = stamped.sample
+        if isinstance(sample, (FrameSample, LostFrame)):  # a union would be made anew for each sample
+            line_ns = self._place_picture(device, time_ns, stamped.device_ns, sample)
+            self._tables[stamped.device].rows.append((sample.device_ticks, stamped.arrival_ns, line_ns))
             return
         self._tables[stamped.device].add(stamped, time_ns, self._start_ns)
-        if isinstance(stamped.sample, FixSample) and stamped.sample.quality > 0:
-            self._fixes.setdefault(stamped.device, FixTimes()).add(stamped.sample.device_ticks, time_ns)
+        if isinstance(sample, FixSample) and sample.quality > 0:
+            self._fixes.setdefault(stamped.device, FixTimes()).add(sample.device_ticks, time_ns)
         if time_ns < 0:
             device.summary.before_start += 1
         else:
@@ -274,17 +276,18 @@ class Pipeline:
 
     def _write(self, released: list[Released[Stamped, FrameSample]]) -> None:
         for entry in released:
-            if isinstance(entry.item, FrameSet):
-                cameras = self._groups[entry.item.group]
-                self._writer.write_frames(entry.time_ns, entry.item.pictures, late=entry.late, cameras=cameras)
+            item = entry.item
+            if isinstance(item, FrameSet):
+                cameras = self._groups[item.group]
+                self._writer.write_frames(entry.time_ns, item.pictures, late=entry.late, cameras=cameras)
                 self._count_late_pictures(entry)
             else:
-                summary = self._devices[entry.item.device].summary
-                summary.late += entry.late
-                if self._write_sample(entry.time_ns, entry.item, late=entry.late):
-                    summary.written += 1
+                device = self._devices[item.device]
+                device.summary.late += entry.late
+                if self._write_sample(device, entry.time_ns, item, late=entry.late):
+                    device.summary.written += 1
                 else:
-                    summary.incomplete += 1
+                    device.summary.incomplete += 1
 
     def _count_late_pictures(self, entry: Released[Stamped, FrameSample]) -> None:
         assert isinstance(entry.item, FrameSet)
@@ -292,15 +295,14 @@ class Pipeline:
             if entry.late and device.camera is not None and entry.item.pictures[device.camera] is not None:
                 device.summary.late += 1
 
-    def _write_sample(self, time_ns: int, stamped: Stamped, *, late: bool) -> bool:
+    def _write_sample(self, device: DeviceInTake, time_ns: int, stamped: Stamped, *, late: bool) -> bool:
         sample = stamped.sample
-        config = self._devices[stamped.device].config
         if isinstance(sample, ImuSample):
             return self._writer.write_imu(stamped.device, time_ns, sample, late=late)
         elif isinstance(sample, FixSample):
             return self._writer.write_fix(time_ns, sample, late=late)
         elif isinstance(sample, PoseSample):
-            return self._writer.write_pose(time_ns, getattr(config, "name", stamped.device), sample, late=late)
+            return self._writer.write_pose(time_ns, getattr(device.config, "name", stamped.device), sample, late=late)
         elif isinstance(sample, ScanSample):
             if stamped.point_host_ns is None:
                 return False

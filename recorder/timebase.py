@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from drivers.samples import ClockPairs, Sample, ScanSample, TwoWayPair
+from drivers.samples import ClockPairs, EventSample, Sample, ScanSample, TwoWayPair
 from recorder.clock import ClockMap, ClockStream
 from recorder.clock_fit import Level
 from recorder.clock_grid import GridTracker
@@ -39,7 +39,7 @@ class Stamped(Struct, frozen=True, eq=False, gc=False):
     host_ns: int
     device_ns: int
     arrival_ns: int
-    sample: Sample
+    sample: EventSample
     point_host_ns: Ints | None = None
     scan_knots: Ints | None = None
 
@@ -55,7 +55,7 @@ class _DeviceStream:
 
 
 # Stream, time on the axis of the clock map, device time (Stamped), arrival without latency, sample.
-_Waiting = tuple[_DeviceStream, int, int, int, Sample]
+_Waiting = tuple[_DeviceStream, int, int, int, EventSample]
 
 
 @dataclass(slots=True)
@@ -204,15 +204,15 @@ class Timebase:
                 count_ns = round(sample.device_ticks * NS_PER_S / entry.tick_hz)
                 device_ns = clock.counter.time_ns(count_ns, arrival_ns) or axis_ns
             clock.waiting.append((entry, axis_ns, device_ns, arrival_ns, sample))
-        self._watch_epoch(clock, arrival_ns)
-
-    def _watch_epoch(self, clock: _Clock, arrival_ns: int) -> None:
         if clock.map.epoch != clock.epoch:
-            if clock.epoch >= 0:
-                self._epochs_begun.append((clock.name, clock.map.epoch))
-            clock.epoch = clock.map.epoch
-            clock.hold_until_ns = max(clock.hold_until_ns, arrival_ns + HOLD_NS)
-            clock.is_new = True
+            self._begin_epoch(clock, arrival_ns)
+
+    def _begin_epoch(self, clock: _Clock, arrival_ns: int) -> None:
+        if clock.epoch >= 0:
+            self._epochs_begun.append((clock.name, clock.map.epoch))
+        clock.epoch = clock.map.epoch
+        clock.hold_until_ns = max(clock.hold_until_ns, arrival_ns + HOLD_NS)
+        clock.is_new = True
 
     def release(self, now_ns: int) -> list[Stamped]:
         """All samples fed so far but those of an epoch that is too young; those of one device in order."""
@@ -229,13 +229,14 @@ class Timebase:
 
     def _stamp_all(self, waiting: list[_Waiting]) -> list[Stamped]:
         """Samples that came together and would be stamped after their arrival are moved together: they stay apart."""
-        mapped_ns = [entry.stream.host_ns(axis_ns) for entry, axis_ns, _, _, _ in waiting]
+        mapped_ns = [entry.stream.estimator.host_ns(axis_ns) for entry, axis_ns, _, _, _ in waiting]
         beyond_ns: dict[tuple[str, int], int] = {}
         for (entry, _, _, arrival_ns, _), host_ns in zip(waiting, mapped_ns, strict=True):
-            key = (entry.device, arrival_ns)
-            beyond_ns[key] = max(beyond_ns.get(key, 0), host_ns - arrival_ns)
+            if host_ns > arrival_ns:
+                key = (entry.device, arrival_ns)
+                beyond_ns[key] = max(beyond_ns.get(key, 0), host_ns - arrival_ns)
         return [
-            self._stamp(host_ns - beyond_ns[entry.device, arrival_ns], entry, device_ns, arrival_ns, sample)
+            self._stamp(host_ns - beyond_ns.get((entry.device, arrival_ns), 0), entry, device_ns, arrival_ns, sample)
             for (entry, _, device_ns, arrival_ns, sample), host_ns in zip(waiting, mapped_ns, strict=True)
         ]
 
@@ -244,12 +245,15 @@ class Timebase:
         self.refit()
         return self.release(max((clock.hold_until_ns for clock in self._clocks.values()), default=0))
 
-    def _stamp(self, host_ns: int, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: Sample) -> Stamped:
+    def _stamp(
+        self, host_ns: int, entry: _DeviceStream, device_ns: int, arrival_ns: int, sample: EventSample
+    ) -> Stamped:
         point_host_ns = knots = None
         if isinstance(sample, ScanSample) and len(sample.points):
             point_host_ns, knots = _scan_times(entry, sample.points["timestamp"], arrival_ns)
             host_ns = int(point_host_ns.max())
-        host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
+        if host_ns <= entry.last_host_ns:
+            host_ns = max(host_ns, min(entry.last_host_ns + 1, arrival_ns))
         entry.last_host_ns = host_ns
         return Stamped(entry.device, host_ns, device_ns, arrival_ns + entry.latency_ns, sample, point_host_ns, knots)
 
