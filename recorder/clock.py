@@ -107,9 +107,13 @@ class ClockStream:
     def map(self, ticks: int, arrival_ns: int) -> int:
         """Host time of one event: learn from it, then answer."""
         device_ns = self.observe(ticks, arrival_ns)
-        stamp_ns = max(self.estimator.host_ns(device_ns), self._stamp_ns)
-        self._stamp_ns = min(stamp_ns, arrival_ns)
-        return self._stamp_ns
+        stamp_ns = self.estimator.host_ns(device_ns)
+        if stamp_ns < self._stamp_ns:
+            stamp_ns = self._stamp_ns
+        if stamp_ns > arrival_ns:
+            stamp_ns = arrival_ns
+        self._stamp_ns = stamp_ns
+        return stamp_ns
 
     def observe(self, ticks: int, arrival_ns: int) -> int:
         """Learn from one sample; its device time on the map's axis, int ns."""
@@ -123,7 +127,8 @@ class ClockStream:
             return self._observe_unsure(int(ticks), int(arrival_ns))
         x = device_ns - estimator.anchor_device
         y = arrival_ns - estimator.anchor_host - x
-        rest = y - estimator.fit.offset - estimator.fit.slope * x
+        fit = estimator.fit
+        rest = y - fit.offset - fit.slope * x
         usual = -estimator.early_ns < rest < self._late_ns
         if not usual or self._suspects or self._reconnected or self._lateness is not None:
             return self._observe_unsure(int(ticks), int(arrival_ns))

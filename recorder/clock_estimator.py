@@ -57,11 +57,14 @@ class SlewedLine:
 
     def at(self, x: float) -> float:
         """Offset at x, ns."""
-        gap = self.gap
+        offset, gap = self.offset + self.slope * x, self.gap
         if gap:
-            left = abs(gap) - self.rate * max(x - self.since_x, 0.0)
-            gap = math.copysign(left, gap) if left > 0 else 0.0
-        return self.offset + self.slope * x + gap
+            closed = self.rate * (x - self.since_x) if x > self.since_x else 0.0
+            if gap > closed:
+                offset += gap - closed
+            elif gap < -closed:
+                offset += gap + closed
+        return offset
 
     def many(self, x: Floats) -> Floats:
         """Offsets at many x, ns."""
