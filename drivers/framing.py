@@ -54,8 +54,8 @@ class Framer:
         buffer = self._buffer + data if self._buffer else data
         frames: list[tuple[int, bytes]] = []
         offset, length_at, search = self._buffer_offset, self.length, self.start.search
-        position = 0
-        while match := search(buffer, position):
+        position, end = 0, len(buffer)
+        while position < end and (match := search(buffer, position)):
             start = match.start()
             if start != position:
                 self.skipped_bytes += start - position
@@ -71,8 +71,8 @@ class Framer:
             frames.append((offset + position, buffer[position : position + length]))
             position += length
         else:
-            self.skipped_bytes += len(buffer) - position
-            position = len(buffer)
+            self.skipped_bytes += end - position
+            position = end
         self._buffer = buffer[position:]
         self._buffer_offset = offset + position
         return frames

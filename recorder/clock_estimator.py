@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -237,8 +238,7 @@ class Estimator:
         self._begin_x = x
         self._next_refit_x = x
         self._buckets: list[Bucket] = []
-        self._open_x: list[int] = []
-        self._open_y: list[int] = []
+        self._open_x, self._open_y = array("q"), array("q")
         self._open_end = x
         self._high_since: tuple[float, float] | None = None  # where, how high
         self._ready: tuple[int, Line] | None = None
@@ -266,8 +266,8 @@ class Estimator:
         start, epoch = 0, self.epoch
         while start < x.size and self.epoch == epoch:
             stop = max(start + 1, int(np.searchsorted(x, self._open_end, side="right")))
-            self._open_x += x[start:stop].tolist()
-            self._open_y += y[start:stop].tolist()
+            self._open_x.extend(x[start:stop].tolist())
+            self._open_y.extend(y[start:stop].tolist())
             self.last_x = max(self.last_x, float(x[min(stop, x.size) - 1]))
             start = stop
             if self.last_x >= self._open_end:
@@ -312,7 +312,7 @@ class Estimator:
             self._buckets.append(bucket)
         if self.grid is not None:
             self.grid.feed(x, y, self.fit.slope)
-        self._open_x, self._open_y = [], []
+        self._open_x, self._open_y = array("q"), array("q")
         self._open_end = last + self._pace_ns(BUCKET_S[1])
         while self._buckets and last - self._buckets[0].last_x > WINDOW_S * S:
             del self._buckets[0]
@@ -326,7 +326,7 @@ class Estimator:
                 self.refit()
 
     def _open_points(self) -> tuple[Floats, Floats]:
-        x, y = np.array(self._open_x, dtype=np.float64), np.array(self._open_y, dtype=np.float64)
+        x, y = (np.frombuffer(values, np.int64).astype(np.float64) for values in (self._open_x, self._open_y))
         if np.any(np.diff(x) < 0):  # streams of one clock interleave
             order = np.argsort(x, kind="stable")
             return x[order], y[order]

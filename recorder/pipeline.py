@@ -6,6 +6,7 @@
 `take` is called with every sample in order of arrival, `advance` every few milliseconds, `finish` once.
 """
 
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -65,7 +66,7 @@ class DeviceInTake:
 class _ClockTable:
     """Rows of a device's clock table (see recorder.recording.raw) since they were last taken."""
 
-    rows: list[tuple[int, int, int]] = field(default_factory=list)
+    rows: "array[int]" = field(default_factory=lambda: array("q"))
     batches: list[npt.NDArray[np.int64]] = field(default_factory=list)
 
     def add(self, stamped: Stamped, time_ns: int, start_ns: int) -> None:
@@ -75,14 +76,14 @@ class _ClockTable:
             if stamped.scan_knots is not None:
                 self.batches.append(scan_rows(stamped.scan_knots - np.array([0, start_ns]), time_ns))
         elif sample.device_ticks is not None:
-            self.rows.append((sample.device_ticks, stamped.arrival_ns, time_ns))
+            self.rows.extend((sample.device_ticks, stamped.arrival_ns, time_ns))
 
     def taken(self) -> list[npt.NDArray[np.int64]]:
         """All rows, which are then forgotten."""
         batches, self.batches = self.batches, []
         if self.rows:
-            batches.append(np.array(self.rows, dtype=np.int64))
-            self.rows = []
+            batches.append(np.frombuffer(self.rows, np.int64).reshape(-1, 3))
+            self.rows = array("q")
         return [np.concatenate(batches)] if batches else []
 
 
@@ -193,7 +194,7 @@ class Pipeline:
         sample = stamped.sample
         if isinstance(sample, (FrameSample, LostFrame)):  # a union would be made anew for each sample
             line_ns = self._place_picture(device, time_ns, stamped.device_ns, sample)
-            self._tables[stamped.device].rows.append((sample.device_ticks, stamped.arrival_ns, line_ns))
+            self._tables[stamped.device].rows.extend((sample.device_ticks, stamped.arrival_ns, line_ns))
             return
         self._tables[stamped.device].add(stamped, time_ns, self._start_ns)
         if isinstance(sample, FixSample) and sample.quality > 0:

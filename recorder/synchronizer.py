@@ -7,9 +7,10 @@ Items wait until the watermark has passed their time; the caller moves it (usual
 comes after the watermark passed its time is given out at once and marked late.
 """
 
-import heapq
+from bisect import bisect_right, insort
 from collections import deque
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Generic, TypeVar
 
 from msgspec import Struct
@@ -19,6 +20,8 @@ P = TypeVar("P")
 REMEMBERED_SETS = 256
 ORDER_STEP_NS = 1000
 TOGETHER_NS = 1_000_000  # pictures that one trigger released differ less
+
+_time_ns = itemgetter(0)
 
 
 @dataclass(slots=True)
@@ -63,9 +66,8 @@ class Synchronizer(Generic[T, P]):
     cameras: int
     pair_within_ns: int
     group_of: tuple[int, ...] = ()
-    _heap: list[tuple[int, int, "T | FrameSet[P]"]] = field(default_factory=list)
-    _sequence: int = 0
-    _watermark_ns: int | None = None
+    _waiting: list[tuple[int, "T | FrameSet[P]"]] = field(default_factory=list)  # in time order
+    _watermark_ns: int = -(1 << 62)
     _open_sets: deque[tuple[int, FrameSet[P]]] = field(default_factory=deque)
     _given_out: deque[tuple[int, int, int]] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SETS))
     _times: list[_LastTimes] = field(init=False)
@@ -141,8 +143,7 @@ class Synchronizer(Generic[T, P]):
     def _move(self, moved: FrameSet[P], device_ns: int, time_ns: int) -> None:
         """Have a set that waits go out at another time."""
         self._open_sets = deque(entry for entry in self._open_sets if entry[1] is not moved)
-        self._heap = [entry for entry in self._heap if entry[2] is not moved]
-        heapq.heapify(self._heap)
+        self._waiting = [entry for entry in self._waiting if entry[1] is not moved]
         moved.device_ns = device_ns
         self._open_sets.append((time_ns, moved))
         self._push(time_ns, moved)
@@ -164,20 +165,23 @@ class Synchronizer(Generic[T, P]):
         return time_ns
 
     def _push(self, time_ns: int, item: "T | FrameSet[P]") -> None:
-        heapq.heappush(self._heap, (time_ns, self._sequence, item))
-        self._sequence += 1
+        if self._waiting and time_ns < self._waiting[-1][0]:
+            insort(self._waiting, (time_ns, item), key=_time_ns)
+        else:
+            self._waiting.append((time_ns, item))
 
     def release(self, watermark_ns: int) -> list[Released[T, P]]:
         """All items up to the watermark, in time order; a set that is incomplete by then goes out as it is."""
-        released: list[Released[T, P]] = []
-        while self._heap and self._heap[0][0] <= watermark_ns:
-            time_ns, _, item = heapq.heappop(self._heap)
-            late = self._watermark_ns is not None and time_ns <= self._watermark_ns
+        count = bisect_right(self._waiting, watermark_ns, key=_time_ns)
+        due = self._waiting[:count]
+        del self._waiting[:count]
+        for time_ns, item in due:
             if isinstance(item, FrameSet):
                 self._close_set(time_ns, item)
-            released.append(Released(time_ns, item, late))
-        if self._watermark_ns is None or watermark_ns > self._watermark_ns:
-            self._watermark_ns = watermark_ns
+        released: list[Released[T, P]] = [
+            Released(time_ns, item, time_ns <= self._watermark_ns) for time_ns, item in due
+        ]
+        self._watermark_ns = max(self._watermark_ns, watermark_ns)
         return released
 
     def _close_set(self, time_ns: int, closed: FrameSet[P]) -> None:
@@ -186,8 +190,8 @@ class Synchronizer(Generic[T, P]):
 
     def flush(self) -> list[Released[T, P]]:
         """All that is left, in time order: the end of a take."""
-        return self.release(max((time_ns for time_ns, _, _ in self._heap), default=0))
+        return self.release(self._waiting[-1][0] if self._waiting else 0)
 
     def __len__(self) -> int:
         """How many items wait."""
-        return len(self._heap)
+        return len(self._waiting)
