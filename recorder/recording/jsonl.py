@@ -194,7 +194,6 @@ class LineWriter:
 
     def __init__(self, folder: Path, on_error: Callable[[str, Exception], None]) -> None:
         """Create data.jsonl; it must not exist."""
-        self.written_lines = 0
         self._numbers: Counter[int] = Counter()  # by the first camera of a set
         self._folder = folder
         self._file = HashedFile(folder / DATA_NAME)
@@ -227,22 +226,15 @@ class LineWriter:
         late_lines: list[bytes] = []
         while waiting and _is_ready(waiting[0][0]):
             pending, late = waiting.popleft()
-            line = self._finished(pending)
+            line = pending if isinstance(pending, bytes) else self._finished(pending)
             if line is not None:
                 (late_lines if late else lines).append(line)
         if lines:
-            self._write(self._file, lines)
+            self._file.write(b"".join(lines))
         if late_lines:
-            self._write(self._open_late_file(), late_lines)
+            self._open_late_file().write(b"".join(late_lines))
 
-    def _write(self, file: HashedFile, lines: list[bytes]) -> None:
-        data = b"".join(lines)
-        file.write(data)
-        self.written_lines += data.count(b"\n")
-
-    def _finished(self, pending: Pending) -> bytes | None:
-        if isinstance(pending, bytes):
-            return pending
+    def _finished(self, pending: PendingFrames | PendingScan) -> bytes | None:
         if isinstance(pending, PendingScan):
             return pending.line if pending.ticket.state == "done" else None
         time_s = pending.time_ns / NS_PER_S
@@ -282,9 +274,11 @@ class LineWriter:
 
 
 def _is_ready(pending: Pending) -> bool:
+    if isinstance(pending, bytes):
+        return True
     if isinstance(pending, PendingFrames):
         return all(picture.ticket is None or picture.ticket.state != "pending" for picture in pending.pictures)
-    return not isinstance(pending, PendingScan) or pending.ticket.state != "pending"
+    return pending.ticket.state != "pending"
 
 
 def merge_late_lines(folder: Path) -> FileEntry:
