@@ -34,7 +34,6 @@ GRID_LEVEL = 0.008
 HEIGHT_SIGMA = 0.7  # of the usual height of the lowest arrivals above the floor
 LAW_ERROR = 0.025  # of the mean delay times the law's shape: one sigma of the place of the floor under a fitted law
 CLEARANCE_ERROR = 0.6  # of the height above the place by the delay law
-GRID_LEVEL_S = 120  # the grid's curve is put on the lowest point of this last time
 REFIT_S = 2.0
 SLEW = ((5.0, 0.2), (30.0, 5e-3), (math.inf, 500 * PPM))  # up to this age of the epoch: seconds per second
 KEPT_SKEW_PPM = 2.0  # one sigma of a device's skew across a restart
@@ -107,7 +106,7 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now
     if grid.trust < IGNORE_TRUST:
         return line
     table = np.array(buckets, dtype=np.float64)
-    table = table[table[:, 6] > now_x - GRID_LEVEL_S * S]
+    table = table[table[:, 6] > grid.since_x]  # the curve says nothing of what came before
     low_x, low_y = table[:, 0], table[:, 1]
     curve = trust * grid.at(low_x) + (1 - trust) * (line.offset + line.slope * low_x)
     clearance = float((low_y - curve).min())

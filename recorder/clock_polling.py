@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,8 @@ STARTS = (0.05, 0.3, 0.6)  # of the period below the lowest point
 MIN_KEPT = 0.35
 HIGH_RANK, HIGH_SIGMA = 0.12, 4.0
 FIRST_STEPS = 12
-RIVAL = 4.0  # a maximum less than this below the best one may be the true one
+PLATEAU_STEP = 0.12  # of the period
+NEGLIGIBLE = 6.0  # a height less likely than the best by so much (log) does not count
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
 RECENT = 30  # buckets
 MAX_WAITING = 64
@@ -53,9 +54,10 @@ COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows
 class GridLine:
     """What the grid says: height (ns), slope and curvature (per ns) at `pivot_x`, one sigma of each, and the trust.
 
-    sd_curvature: what is usual with this clock.
+    since_x: of the first arrival it was fitted to. sd_curvature: what is usual with this clock.
     """
 
+    since_x: float
     pivot_x: float
     height: float
     slope: float
@@ -83,6 +85,11 @@ class _Start:
     law: Floats
 
 
+def _absolute(weights: Floats, line: Line, at_x: float) -> tuple[float, float, float]:
+    """Height, slope and curvature at `at_x` from what they are above a line."""
+    return line.at(at_x) + float(weights[0]), line.slope + float(weights[1]) / S, float(weights[2]) / S**2
+
+
 class PollingGrid:
     """Points on the polls of one clock's link and the fit to them.
 
@@ -97,7 +104,6 @@ class PollingGrid:
         self._points_epoch = 0
         self._last: _Start | None = None
         self._load = 0.0
-        self._rivalry = 0.0
         self._real = False
         self._fits = 0
         self._bending = CURVATURE[1] ** 2  # variance of the curvature, learnt from its estimates
@@ -193,27 +199,21 @@ class PollingGrid:
         if best is None:
             return None
         fitted, kept = best
-        covariance = np.asarray(np.linalg.inv(fitted.information), dtype=np.float64)
-        self._last = _Start(
-            end,
-            line.at(end) + fitted.weights[0],
-            line.slope + fitted.weights[1] / S,
-            fitted.weights[2] / S**2,
-            fitted.law,
-        )
-        trust, sd = self._trust(problem, fitted, covariance, kept, t)
+        fitted, weights, sd_height = along_plateau(problem, fitted)
+        self._last = _Start(end, *_absolute(fitted.weights, line, end), fitted.law)
+        trust = self._trust(problem, fitted, kept, t)
+        covariance = np.linalg.inv(fitted.information)
         if trust > 0.5:
-            self._learn_bending(fitted.weights[2], covariance[2, 2])
+            self._learn_bending(fitted.weights[2], float(covariance[2, 2]))
         residues = np.sum([p.residues for p in points], axis=0)
         if on_coarser_grid(residues):
             trust = 0.0
         return GridLine(
+            float(x.min()),
             end,
-            self._last.height,
-            self._last.slope,
-            self._last.curvature,
-            sd[0],
-            sd[1] / S,
+            *_absolute(weights, line, end),
+            sd_height,
+            math.sqrt(max(float(covariance[1, 1]), 0.0)) / S,
             math.sqrt(self._bending) / S**2,
             trust,
             DelayLaw.of(fitted.law),
@@ -241,8 +241,6 @@ class PollingGrid:
             starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in STARTS]
         fits = [problem.climb(*start, FIRST_STEPS if len(starts) > 1 else STEPS) for start in starts]
         best = max(fits, key=lambda fit: fit.value)
-        rivals = [fit.weights[0] - best.weights[0] for fit in fits if fit.value > best.value - RIVAL]
-        self._rivalry = max(0.5 * abs(apart) for apart in rivals) if len(fits) > 1 else 0.7 * self._rivalry
         if not math.isfinite(best.value):
             return None
         kept = without_late(problem, everything, best.weights, best.law, bucket)
@@ -259,28 +257,46 @@ class PollingGrid:
         weight = 0.1 * min(1.0, self._bending / noise)
         self._bending += weight * (min(max(free**2 - noise, least**2), most**2) - self._bending)
 
-    def _trust(
-        self, problem: IntervalFit, fitted: Fitted, covariance: Floats, kept: Floats, t: Floats
-    ) -> tuple[float, tuple[float, float]]:
-        """How far to believe the fit, and one sigma of its height and slope at the newest end."""
-        sd = max(math.sqrt(max(covariance[0, 0], 0.0)), self._flatness(problem, fitted, covariance), self._rivalry)
-        sd_slope = math.sqrt(max(covariance[1, 1], 0.0))
+    def _trust(self, problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> float:
+        """How far to believe the fit."""
         fitness = judge(problem, fitted, kept, t)
         self._load = max(0.85 * self._load, fitness.load)
         share = float(kept.sum()) / max(float(sum(p.count.sum() for p in self.points)), 1.0)
-        trust = fitness.trust * ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
-        return trust / (1 + (sd / (0.4 * problem.period)) ** 2), (sd, sd_slope)
+        return fitness.trust * ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
 
-    def _flatness(self, problem: IntervalFit, fitted: Fitted, covariance: Floats) -> float:
-        """Sigma of the height by trying: before a phase has been seen at two polls the likelihood has a plateau."""
-        towards = covariance[:, 0] / covariance[0, 0]
-        p, sigma = problem.centre.size, 0.0
-        for shift in (-0.35, -0.15, 0.15, 0.35):
-            move = shift * problem.period * towards
-            law = fitted.law + np.clip(move[p:], -1.0, 1.0)
-            drop = fitted.value - problem.value(fitted.weights + move[:p], law)
-            sigma = max(sigma, abs(shift) * problem.period / math.sqrt(2 * max(drop, 0.5)))
-        return sigma
+
+def along_plateau(problem: IntervalFit, best: Fitted) -> tuple[Fitted, Floats, float]:
+    """The best fit known, the mean of the weights over all heights as likely as they are, and one sigma of the height.
+
+    Before a phase has been seen at two polls the law may begin earlier or later by much of the period and explain the
+    same arrivals nearly as well; the likeliest height lies at the upper end of that plateau, the mean in its middle.
+    """
+    covariance = np.linalg.inv(best.information)
+    sigma = math.sqrt(max(float(covariance[0, 0]), 0.0))
+    towards, p = covariance[:, 0] / covariance[0, 0], best.weights.size
+    nearby = [shift * problem.period * towards for shift in (-PLATEAU_STEP, PLATEAU_STEP)]
+    values = [problem.value(best.weights + move[:p], best.law + np.clip(move[p:], -1.0, 1.0)) for move in nearby]
+    drop = best.value - max(values)
+    if drop > NEGLIGIBLE:
+        return best, best.weights, max(sigma, PLATEAU_STEP * problem.period / math.sqrt(2 * drop))
+    fits = [best]
+    for step in (-PLATEAU_STEP * problem.period, PLATEAU_STEP * problem.period):
+        fit, centre, precision = best, problem.centre.copy(), problem.precision.copy()
+        precision[0, 0] = 1.0  # the height is held to a ns, the rest follows
+        for _ in range(round(1 / PLATEAU_STEP)):
+            weights = fit.weights.copy()
+            weights[0] = centre[0] = fit.weights[0] + step
+            fit = replace(problem, centre=centre, precision=precision).climb(weights, fit.law)
+            fits.append(fit)
+            if fit.value < max(f.value for f in fits) - NEGLIGIBLE:
+                break
+    value = np.array([fit.value for fit in fits])
+    share = np.exp(value - value.max())
+    share /= share.sum()
+    weights = np.stack([fit.weights for fit in fits])
+    mean = share @ weights
+    spread = math.sqrt(float(share @ (weights[:, 0] - mean[0]) ** 2))
+    return fits[int(value.argmax())], mean, max(sigma, spread)
 
 
 @dataclass(frozen=True, slots=True)
