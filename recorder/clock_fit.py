@@ -235,8 +235,9 @@ def _blend_window(
         sd_means = math.inf
     if math.isfinite(sd_means):
         white = 1.5 * median(sd_mean)
-        sd_means = math.hypot(sd_means, (0.02 * spread + WANDER * wander) / span) * (1 + minutes**1.25)
-        wander = max(wander, math.sqrt(max(scatter**2 - white**2, 0.0)))
+        before, wander = wander, max(wander, math.sqrt(max(scatter**2 - white**2, 0.0)))
+        step = before if hides is None else wander  # without polls the floor may have moved as well as the means
+        sd_means = math.hypot(sd_means, (0.02 * spread + WANDER * step) / span) * (1 + minutes**1.25)
     if low_x.size >= 3:
         slope_hull, length = hull_slope(low_x, low_y)
         if length > 0 and abs(slope_hull) < MOST_SKEW:
