@@ -200,7 +200,14 @@ class Care:
         for watch in self.watches:
             if events := watch(arrival_ns):
                 told += events
-        return told + self._bad_input(arrival_ns)
+        if self._garbage is None:
+            if not frames:
+                return told
+            # What was skipped so far, when it is not much: the port was opened in the middle of a frame.
+            is_cut = self.decoder.skipped_bytes <= self.cut_bytes
+            now = (self.decoder.bad_frames, self.decoder.skipped_bytes) if is_cut else (0, 0)
+            self._garbage = GarbageWatch(self.decoder, now, now)
+        return told + self._garbage.events(arrival_ns)
 
     def _no_frames(self, arrival_ns: int, data: bytes) -> tuple[DeviceEvent, ...]:
         self._unknown = (self._unknown + data)[-RECOGNISE_BYTES:]
@@ -211,16 +218,6 @@ class Care:
         text = f"{self.where}: bytes come, but no {self.message} for {self.silence_s:g} s{looks_like}"
         self._unknown = b""
         return (DeviceEvent("warning", text),)
-
-    def _bad_input(self, arrival_ns: int) -> tuple[DeviceEvent, ...]:
-        if self._garbage is None:
-            if not self.frames():
-                return ()
-            # What was skipped so far, when it is not much: the port was opened in the middle of a frame.
-            is_cut = self.decoder.skipped_bytes <= self.cut_bytes
-            now = (self.decoder.bad_frames, self.decoder.skipped_bytes) if is_cut else (0, 0)
-            self._garbage = GarbageWatch(self.decoder, now, now)
-        return self._garbage.events(arrival_ns)
 
 
 @dataclass(slots=True)

@@ -117,11 +117,9 @@ class ClockStream:
 
     def observe(self, ticks: int, arrival_ns: int) -> int:
         """Learn from one sample; its device time on the map's axis, int ns."""
-        estimator = self.estimator
-        step = ticks - self._ticks
-        if self._modulus:
-            step %= self._modulus
-        unwrapped = self._ticks + step
+        estimator, before, modulus = self.estimator, self._ticks, self._modulus
+        step = (ticks - before) % modulus if modulus else ticks - before
+        unwrapped = before + step
         device_ns = unwrapped * self._num // self._den + self._own_zero_ns + estimator.zero_ns
         if self._epoch != estimator.epoch or step <= 0 or not -FAR < device_ns < FAR:
             return self._observe_unsure(int(ticks), int(arrival_ns))
@@ -132,7 +130,7 @@ class ClockStream:
         usual = -estimator.early_ns < rest < self._late_ns
         if not usual or self._suspects or self._reconnected or self._lateness is not None:
             return self._observe_unsure(int(ticks), int(arrival_ns))
-        if self._modulus and unwrapped // self._modulus != self._ticks // self._modulus:
+        if modulus and unwrapped // modulus != before // modulus:
             estimator.counts.wraps += 1
         self._ticks, self._device_ns, self._arrival_ns = unwrapped, device_ns, arrival_ns
         estimator.feed(x, y, rest)
