@@ -289,6 +289,7 @@ class Pipeline:
                     device.summary.written += 1
                 else:
                     device.summary.incomplete += 1
+        self._writer.hand_over()
 
     def _count_late_pictures(self, entry: Released[Stamped, FrameSample]) -> None:
         assert isinstance(entry.item, FrameSet)

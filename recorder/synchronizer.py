@@ -76,9 +76,12 @@ class Synchronizer(Generic[T, P]):
         """No camera has a picture yet."""
         self._times = [_LastTimes() for _ in range(self.cameras)]
 
-    def add(self, time_ns: int, item: T) -> None:
+    def add(self, time_ns: int, item: "T | FrameSet[P]") -> None:
         """Take an item of any stream but cameras."""
-        self._push(time_ns, item)
+        if self._waiting and time_ns < self._waiting[-1][0]:
+            insort(self._waiting, (time_ns, item), key=_time_ns)
+        else:
+            self._waiting.append((time_ns, item))
 
     def add_picture(self, camera: int, device_ns: int, time_ns: int, picture: P | None) -> int:
         """Take a camera's picture (None: it was taken and is lost) and pair it by device time.
@@ -105,7 +108,7 @@ class Synchronizer(Generic[T, P]):
                 time_ns = self._free_after(own.last_ns)
             own.add(time_ns)
         self._open_sets.append((time_ns, frame_set))
-        self._push(time_ns, frame_set)
+        self.add(time_ns, frame_set)
         return time_ns
 
     def _free_after(self, time_ns: int) -> int:
@@ -146,7 +149,7 @@ class Synchronizer(Generic[T, P]):
         self._waiting = [entry for entry in self._waiting if entry[1] is not moved]
         moved.device_ns = device_ns
         self._open_sets.append((time_ns, moved))
-        self._push(time_ns, moved)
+        self.add(time_ns, moved)
 
     def _between_neighbours(self, group: int, device_ns: int, time_ns: int) -> int:
         """Keep sets of a group in the order of their device times, which mapped times of two cameras may contradict.
@@ -163,12 +166,6 @@ class Synchronizer(Generic[T, P]):
         if after_ns is not None and time_ns >= after_ns:
             time_ns = after_ns - ORDER_STEP_NS if before_ns is None else (before_ns + after_ns) // 2
         return time_ns
-
-    def _push(self, time_ns: int, item: "T | FrameSet[P]") -> None:
-        if self._waiting and time_ns < self._waiting[-1][0]:
-            insort(self._waiting, (time_ns, item), key=_time_ns)
-        else:
-            self._waiting.append((time_ns, item))
 
     def release(self, watermark_ns: int) -> list[Released[T, P]]:
         """All items up to the watermark, in time order; a set that is incomplete by then goes out as it is."""

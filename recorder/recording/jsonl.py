@@ -27,6 +27,7 @@ LATE_NAME = "late.jsonl"
 FLUSH_S = 0.1
 SYNC_S = 1.0
 QUEUE_BYTES = 64 << 20
+HELD_BYTES = 8192
 LINE_BYTES = 300
 MILLIMETRE_M = 0.001
 
@@ -198,19 +199,31 @@ class LineWriter:
         self._folder = folder
         self._file = HashedFile(folder / DATA_NAME)
         self._late_file: HashedFile | None = None
-        self._queue: ByteQueue[tuple[Pending, bool]] = ByteQueue(QUEUE_BYTES)
+        self._queue: ByteQueue[list[tuple[Pending, bool]]] = ByteQueue(QUEUE_BYTES)
+        self._held: list[tuple[Pending, bool]] = []
+        self._held_bytes = 0
         self._on_error = on_error
         self._thread = start_thread("jsonl", self._run, self._failed)
 
     def put(self, line: Pending, *, late: bool = False) -> None:
-        """Take the next line, or lines, with their ends; waits when the disk is far behind."""
-        self._queue.put((line, late), len(line) if isinstance(line, bytes) else LINE_BYTES)
+        """Take the next line, or lines, with their ends; held until `hand_over`, unless there are many."""
+        self._held.append((line, late))
+        self._held_bytes += len(line) if isinstance(line, bytes) else LINE_BYTES
+        if self._held_bytes > HELD_BYTES:
+            self.hand_over()
+
+    def hand_over(self) -> None:
+        """Let what is held be written; waits when the disk is far behind."""
+        if self._held:
+            self._queue.put(self._held, self._held_bytes)
+            self._held, self._held_bytes = [], 0
 
     def _run(self) -> None:
         waiting: deque[tuple[Pending, bool]] = deque()
         last_sync_s = time.monotonic()
         while waiting or not self._queue.ended:
-            waiting.extend(self._queue.get_all(FLUSH_S))
+            for lines in self._queue.get_all(FLUSH_S):
+                waiting.extend(lines)
             self._write_ready(waiting)
             files = [self._file] if self._late_file is None else [self._file, self._late_file]
             for file in files:
@@ -261,6 +274,7 @@ class LineWriter:
 
     def close(self) -> dict[str, FileEntry]:
         """Write what is left, merge late lines in, make all of it durable; gives size and hash."""
+        self.hand_over()
         self._queue.close()
         self._thread.join()
         try:

@@ -75,6 +75,7 @@ def main() -> None:
         writer.write_frames(time_ns, [sample, sample if number >= silent_until else None])
         imu = ImuSample(number, number, (0.0, 0.0, 9.81), (0.0, 0.0, 0.1))
         writer.write_imu("imu", time_ns, imu)
+        writer.hand_over()
         number += 1
         time.sleep(PERIOD_NS / 1e9)
 

@@ -169,6 +169,7 @@ def test_a_line_waits_for_its_ticket_and_those_after_it_wait_too(tmp_path, read_
         writer.put(PendingScan(pending, plain(MS)))
     for index in range(2, 5):
         writer.put(plain(index * MS))
+        writer.hand_over()
         until(lambda: writer._queue.waiting_bytes == 0)  # the thread has taken it, and looked at the ones before
     until(lambda: (tmp_path / "data.jsonl").read_bytes().endswith(b"\n"))
     assert [line["time"] for line in read_lines(tmp_path)] == [0]

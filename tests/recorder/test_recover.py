@@ -80,6 +80,7 @@ def write_all(writer, pictures, late_set=None):
             writer.write_scan(
                 int(stamps_ns[-1]), "RoboSense M1 XYZIRT", ScanSample(points, 0, 0, 1, 1, 0, False), stamps_ns
             )
+    writer.hand_over()
     writer.write_clock(ClockState(1.0, "cameras", 0, 3.5, 200.0))
     writer.events.write("right", "gap", "2 pictures lost before this one", 2)
 
