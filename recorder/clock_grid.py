@@ -43,7 +43,9 @@ RESIDUES = 30
 EVENTS = 20
 
 SHAPES = np.geomspace(0.5, 10.0, 73)  # of the gamma law
-UNITS = np.linspace(0.0, 7.0, 280) ** 2  # delays in units of the law's scale
+SHAPE_STEP = math.log(20.0) / 72
+UNIT_STEP = 7.0 / 279
+UNITS = (UNIT_STEP * np.arange(280)) ** 2  # delays in units of the law's scale
 LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log of (ratio of the tail's mean - 2)
 LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(3.0)])
 LAW_SIGMA = np.array([0.5, 50.0, 0.8, 0.7])
@@ -64,6 +66,7 @@ def _gamma_table() -> Floats:
 
 
 _TABLE = _gamma_table()
+_GAPS = np.diff(UNITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,16 +106,18 @@ class DelayLaw:
         return self.shape * self.scale * (1 + self.weight * (self.ratio - 1))
 
     def cdf(self, delay: Floats) -> tuple[Floats, Floats]:
-        """F and its derivatives (n, 1 + LAW) by the delay and by the parameters."""
+        """F and its derivatives (1 + LAW, n) by the delay and by the parameters."""
         k, theta, w = self.shape, self.scale, self.weight
         delay = np.maximum(delay, 0.0)
         unit = delay / theta
-        at = np.interp(math.log(k), np.log(SHAPES), np.arange(SHAPES.size))
+        at = math.log(k / SHAPES[0]) / SHAPE_STEP
         row = min(int(at), SHAPES.size - 2)
-        low, high = _TABLE[row], _TABLE[row + 1]
-        step = math.log(SHAPES[1] / SHAPES[0])
-        body = np.interp(unit, UNITS, low + (at - row) * (high - low), right=1.0)
-        body_by_shape = np.interp(unit, UNITS, (high - low) / step, right=0.0)
+        by_shape = (_TABLE[row + 1] - _TABLE[row]) / SHAPE_STEP
+        values = _TABLE[row] + (at - row) * SHAPE_STEP * by_shape
+        node = np.minimum(np.sqrt(unit) / UNIT_STEP, UNITS.size - 1.001).astype(np.int64)
+        share = np.minimum((unit - UNITS[node]) / _GAPS[node], 1.0)
+        body = values[node] + share * np.diff(values)[node]
+        body_by_shape = by_shape[node] + share * np.diff(by_shape)[node]
         log_density = (k - 1) * np.log(np.maximum(unit, 1e-9)) - unit - math.lgamma(k)
         body_density = np.exp(np.minimum(log_density, 10.0)) / theta * (delay > 0)
         mean = self.ratio * k * theta
@@ -122,7 +127,7 @@ class DelayLaw:
         by_tail = -w * delay * tail_density
         by_ratio = by_tail * (1 - 2 / self.ratio)
         by_weight = (1 - decay - body) * w * (1 - 2 * w)
-        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_ratio], axis=1)
+        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_ratio])
         return (1 - w) * body + w * (1 - decay), slopes
 
     def seen(self, distance: Floats, period: float) -> tuple[Floats, Floats]:
@@ -130,8 +135,8 @@ class DelayLaw:
         n = distance.size
         value, slopes = self.cdf(np.concatenate([distance, distance - period]))
         soft = OUTLIERS * np.exp(np.clip(distance / (SOFT_EDGE * period), -300.0, 0.0))
-        by = slopes[:n] - slopes[n:]
-        by[:, 0] += soft / (SOFT_EDGE * period) * (distance < 0)
+        by = slopes[:, :n] - slopes[:, n:]
+        by[0] += soft / (SOFT_EDGE * period) * (distance < 0)
         return np.maximum(value[:n] - value[n:], 0.0) + soft, by
 
 
@@ -157,16 +162,16 @@ class IntervalFit:
         """Log posterior, its gradient and the information matrix (outer product of scores)."""
         p = weights.size
         seen, slopes = DelayLaw.of(law).seen(self.height - self.basis @ weights, self.period)
-        slopes /= seen[:, None]
-        score = np.concatenate([-slopes[:, :1] * self.basis, slopes[:, 1:]], axis=1)
-        weighted = score * self.count[:, None]
+        slopes /= seen
+        score = np.concatenate([-slopes[0] * self.basis.T, slopes[1:]])
+        weighted = score * self.count
         off, law_off = weights - self.centre, (law - LAW_PRIOR) / LAW_SIGMA
         pull = self.precision @ off
         value = float(self.count @ np.log(seen)) - 0.5 * float(off @ pull) - 0.5 * float(law_off @ law_off)
-        gradient = weighted.sum(axis=0)
+        gradient = weighted.sum(axis=1)
         gradient[:p] -= pull
         gradient[p:] -= law_off / LAW_SIGMA
-        information = weighted.T @ score
+        information = weighted @ score.T
         information[:p, :p] += self.precision
         information[np.arange(p, p + LAW), np.arange(p, p + LAW)] += LAW_SIGMA**-2
         return value, gradient, information
