@@ -238,7 +238,8 @@ class PollingGrid:
         if not starts or span_s < YOUNG_S or self._fits % 8 == 0:
             mean = float(problem.count @ problem.height / problem.count.sum()) - low - 0.5 * problem.period
             law = LAW_PRIOR + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
-            starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in STARTS]
+            fresh = [STARTS[self._fits % len(STARTS)]] if starts else STARTS  # in turn, to save time
+            starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in fresh]
         fits = [problem.climb(*start, FIRST_STEPS if len(starts) > 1 else STEPS) for start in starts]
         best = max(fits, key=lambda fit: fit.value)
         if not math.isfinite(best.value):
