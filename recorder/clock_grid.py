@@ -46,9 +46,10 @@ SHAPES = np.geomspace(0.5, 10.0, 73)  # of the gamma law
 SHAPE_STEP = math.log(20.0) / 72
 UNIT_STEP = 7.0 / 279
 UNITS = (UNIT_STEP * np.arange(280)) ** 2  # delays in units of the law's scale
-LAW = 4  # parameters: log shape, log scale, logit weight of the tail, log of (ratio of the tail's mean - 2)
-LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(3.0)])
-LAW_SIGMA = np.array([0.5, 50.0, 0.8, 0.7])
+# of the law: log shape, log scale, logit weight of the tail, log of (ratio of the tail's mean - 2); perhaps log power
+LAW_PRIOR = np.array([math.log(1.5), 0.0, -3.0, math.log(3.0), 0.0])
+LAW_SIGMA = np.array([0.5, 50.0, 0.8, 0.7, 0.4])
+GAMMA = 4  # parameters of a law without a power
 OUTLIERS = 2e-4
 SOFT_EDGE = 0.02  # of the period: how fast "earlier than possible" becomes impossible
 STEPS = 6
@@ -87,29 +88,38 @@ class GridPoints:
 
 @dataclass(frozen=True, slots=True)
 class DelayLaw:
-    """(1 - weight) gamma(shape, scale) + weight exponential(ratio * shape * scale)."""
+    """(1 - weight) gamma(shape, scale) + weight exponential(ratio * scale * shape^(1 / power)).
+
+    With a power, (delay / scale)^power is what has the gamma law (Stacy, "A generalization of the gamma distribution",
+    Ann. Math. Statist. 33, 1962); Weibull laws are those of shape 1.
+    """
 
     shape: float
     scale: float
     weight: float
     ratio: float
+    power: float | None
 
     @classmethod
     def of(cls, law: Floats) -> DelayLaw:
-        """From the four unbounded parameters."""
+        """From the four or five unbounded parameters."""
         shape = math.exp(min(max(law[0], math.log(0.8)), math.log(8.0)))
-        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), 2 + math.exp(law[3]))
+        power = math.exp(min(max(law[GAMMA], -1.0), 1.0)) if law.size > GAMMA else None
+        return cls(shape, math.exp(law[1]), 0.5 / (1 + math.exp(-law[2])), 2 + math.exp(law[3]), power)
 
     @property
     def mean_ns(self) -> float:
         """Mean delay above the floor."""
-        return self.shape * self.scale * (1 + self.weight * (self.ratio - 1))
+        power = self.power or 1.0
+        body = math.exp(math.lgamma(self.shape + 1 / power) - math.lgamma(self.shape))
+        tail = self.ratio * self.shape ** (1 / power)
+        return self.scale * ((1 - self.weight) * body + self.weight * tail)
 
     def cdf(self, delay: Floats) -> tuple[Floats, Floats]:
-        """F and its derivatives (1 + LAW, n) by the delay and by the parameters."""
-        k, theta, w = self.shape, self.scale, self.weight
+        """F and its derivatives (1 + parameters, n) by the delay and by the parameters."""
+        k, theta, w, p = self.shape, self.scale, self.weight, self.power or 1.0
         delay = np.maximum(delay, 0.0)
-        unit = delay / theta
+        unit = delay / theta if self.power is None else (delay / theta) ** p
         at = math.log(k / SHAPES[0]) / SHAPE_STEP
         row = min(int(at), SHAPES.size - 2)
         by_shape = (_TABLE[row + 1] - _TABLE[row]) / SHAPE_STEP
@@ -120,15 +130,20 @@ class DelayLaw:
         body_by_shape = by_shape[node] + share * np.diff(by_shape)[node]
         log_density = (k - 1) * np.log(np.maximum(unit, 1e-9)) - unit - math.lgamma(k)
         body_density = np.exp(np.minimum(log_density, 10.0)) / theta * (delay > 0)
-        mean = self.ratio * k * theta
+        if self.power is not None:
+            body_density *= p * np.maximum(delay / theta, 1e-9) ** (p - 1)
+        mean = self.ratio * k ** (1 / p) * theta
         decay = np.exp(-delay / mean)
         tail_density = decay / mean * (delay > 0)
         density = (1 - w) * body_density + w * tail_density
         by_tail = -w * delay * tail_density
         by_ratio = by_tail * (1 - 2 / self.ratio)
         by_weight = (1 - decay - body) * w * (1 - 2 * w)
-        slopes = np.stack([density, (1 - w) * body_by_shape + by_tail, -delay * density, by_weight, by_ratio])
-        return (1 - w) * body + w * (1 - decay), slopes
+        slopes = [density, (1 - w) * body_by_shape + by_tail / p, -delay * density, by_weight, by_ratio]
+        if self.power is not None:
+            by_log_delay = (1 - w) * body_density * delay * np.log(np.maximum(delay / theta, 1e-9))
+            slopes.append(by_log_delay - by_tail * math.log(k) / p)
+        return (1 - w) * body + w * (1 - decay), np.stack(slopes)
 
     def seen(self, distance: Floats, period: float) -> tuple[Floats, Floats]:
         """Probability of the poll at `distance` after the event, and its derivatives like `cdf`."""
@@ -160,20 +175,20 @@ class IntervalFit:
 
     def objective(self, weights: Floats, law: Floats) -> tuple[float, Floats, Floats]:
         """Log posterior, its gradient and the information matrix (outer product of scores)."""
-        p = weights.size
+        p, n = weights.size, law.size
         seen, slopes = DelayLaw.of(law).seen(self.height - self.basis @ weights, self.period)
         slopes /= seen
         score = np.concatenate([-slopes[0] * self.basis.T, slopes[1:]])
         weighted = score * self.count
-        off, law_off = weights - self.centre, (law - LAW_PRIOR) / LAW_SIGMA
+        off, law_off = weights - self.centre, (law - LAW_PRIOR[:n]) / LAW_SIGMA[:n]
         pull = self.precision @ off
         value = float(self.count @ np.log(seen)) - 0.5 * float(off @ pull) - 0.5 * float(law_off @ law_off)
         gradient = weighted.sum(axis=1)
         gradient[:p] -= pull
-        gradient[p:] -= law_off / LAW_SIGMA
+        gradient[p:] -= law_off / LAW_SIGMA[:n]
         information = weighted @ score.T
         information[:p, :p] += self.precision
-        information[np.arange(p, p + LAW), np.arange(p, p + LAW)] += LAW_SIGMA**-2
+        information[np.arange(p, p + n), np.arange(p, p + n)] += LAW_SIGMA[:n] ** -2
         return value, gradient, information
 
     def value(self, weights: Floats, law: Floats) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 
 from recorder.clock_fit import Floats, Hidden, Hides, Line, SlopePrior
 from recorder.clock_grid import (
+    GAMMA,
     LAW_PRIOR,
     RESIDUES,
     STEPS,
@@ -127,10 +128,11 @@ class PollingGrid:
         period = self.period_ns * (1 + self.tracker.frequency)
         if not period or not self.points:
             return None
-        points = self.points[:]
+        events_x = np.concatenate([p.events_x for p in self.points[:]])
+        events_x -= events_x[0]
 
         def hidden(slope: float) -> Hidden:
-            gap = widest_gap(points, period, slope)
+            gap = widest_gap(events_x * (1 + slope), period)
             return Hidden(gap, gap) if period < COARSE_NS else Hidden(max(gap, COARSE_ERROR * period), period)
 
         return hidden
@@ -237,7 +239,7 @@ class PollingGrid:
         self._fits += 1
         if not starts or span_s < YOUNG_S or self._fits % 8 == 0:
             mean = float(problem.count @ problem.height / problem.count.sum()) - low - 0.5 * problem.period
-            law = LAW_PRIOR + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
+            law = LAW_PRIOR[:GAMMA] + np.array([0.0, math.log(max(mean, 0.1 * problem.period) / 1.5), 0.0, 0.0])
             fresh = [STARTS[self._fits % len(STARTS)]] if starts else STARTS  # in turn, to save time
             starts += [(np.array([low - share * problem.period, 0.0, 0.0]), law) for share in fresh]
         fits = [problem.climb(*start, FIRST_STEPS if len(starts) > 1 else STEPS) for start in starts]
@@ -341,10 +343,9 @@ def without_late(
     return np.where(kept, count, 0.0) if count[kept].sum() > MIN_KEPT * count.sum() else count
 
 
-def widest_gap(points: list[GridPoints], period: float, slope: float) -> float:
+def widest_gap(events: Floats, period: float) -> float:
     """Of the phases of the samples against the polls: so far the floor may be hidden from the lowest arrivals."""
-    x = np.concatenate([p.events_x for p in points])
-    phase = np.sort((x - x[0]) * (1 + slope) % period)
+    phase = np.sort(events % period)
     return float(np.diff(phase, append=phase[0] + period).max())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorder.clock_fit import LEVEL, MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
-from recorder.clock_grid import LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
+from recorder.clock_grid import GAMMA, LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
 from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
 
 Ints = NDArray[np.int64]
@@ -29,11 +29,14 @@ CLEAR = 0.15  # of the spread: a third of a piece further than this above the cu
 GRID_KNOT_S = 20.0
 MIN_POLLED = 0.5  # share of the seconds in which polls are seen, for them to count
 GRID_CURVATURE = 0.02e-6 / S
+NO_GAMMA = 5.0  # gain of the log posterior by which a law with a power is proven
+JITTER_ERROR = 0.5  # of the polls' jitter: one sigma of where the polls are
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
 ROUNDS = 4
 FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
+ARRIVAL_NS = 100.0  # how well an arrival can be stamped at best
 LOWEST = 1.0  # of the median delay by the root of their number: how late the quickest is, for gamma laws of shape 2
 GAP_SIGMA = 0.5  # of the gap between the samples' phases that may hide the floor
 LAW_ERROR = 0.008  # of the mean delay times the law's shape, times the shape again but at least 2: see docs/clocks.md
@@ -163,9 +166,9 @@ def envelope_by_data(x: Floats, y: Floats, prior: SlopePrior | None = None) -> C
             break
         curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], spacing_s), prior)
         limit_ns = CLEAR * float(np.median(y - curve.at(x)))
-    _, unsure = touching_error(low_y - curve.at(low_x), curve.knots_x.size - 1)
-    lowest = LOWEST * float(np.median(y - curve.at(x))) / math.sqrt(x.size)
-    return replace(curve, sigma_ns=math.hypot(LEVEL * unsure, lowest))
+    usual, unsure = touching_error(low_y - curve.at(low_x), curve.knots_x.size - 1)
+    lowest = min(LOWEST * float(np.median(y - curve.at(x))) / math.sqrt(x.size), usual)
+    return replace(curve, sigma_ns=math.hypot(LEVEL * unsure, lowest, ARRIVAL_NS))
 
 
 def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], float, float]:
@@ -218,7 +221,7 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
     problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
     low = float(height.min())
     mean = max(float(count @ height / count.sum()) - low - 0.5 * period, 0.1 * period)
-    law = LAW_PRIOR + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
+    law = LAW_PRIOR[:GAMMA] + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
     fits = [problem.climb(np.full(knots_x.size, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
     best = max(fits, key=lambda fit: fit.value)
     best = problem.climb(best.weights, best.law, MANY_STEPS)
@@ -228,14 +231,20 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
             break
         problem.count = kept
         best = problem.climb(best.weights, best.law, MANY_STEPS)
-    variance = np.linalg.inv(best.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
-    found = DelayLaw.of(best.law)
-    law_error = LAW_ERROR * found.shape * max(found.shape, 2.0) * found.mean_ns
+    wider = problem.climb(best.weights, np.append(best.law, 0.0), MANY_STEPS)
+    variance = np.linalg.inv(wider.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
+    law_error = 0.0
+    if wider.value > best.value + NO_GAMMA:
+        best, found = wider, DelayLaw.of(wider.law)
+        law_error = LAW_ERROR * found.shape * max(found.shape, 2.0) * found.mean_ns
     heights = level + best.weights
-    gap = widest_gap(points, true_period, float(heights[-1] - heights[0]) / float(knots_x[-1] - knots_x[0]))
-    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), law_error, GAP_SIGMA * gap)
+    curve = Curve(knots_x, heights)
+    events_x = np.concatenate([p.events_x for p in points])
+    gap = widest_gap(events_x - events_x[0] + curve.at(events_x), true_period)
+    jitter = JITTER_ERROR * float(np.median([p.jitter_ns for p in points]))
+    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), law_error, jitter, GAP_SIGMA * gap)
     lowest = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
-    return Curve(knots_x, heights, sigma), _trust(problem, best, at_x, points), math.hypot(lowest, GAP_SIGMA * gap)
+    return replace(curve, sigma_ns=sigma), _trust(problem, best, at_x, points), math.hypot(lowest, GAP_SIGMA * gap)
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
