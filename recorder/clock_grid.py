@@ -110,9 +110,9 @@ class DelayLaw:
     @property
     def mean_ns(self) -> float:
         """Mean delay above the floor."""
-        power = self.power or 1.0
-        body = math.exp(math.lgamma(self.shape + 1 / power) - math.lgamma(self.shape))
-        tail = self.ratio * self.shape ** (1 / power)
+        inverse = 1.0 if self.power is None else 1 / self.power
+        body = math.exp(math.lgamma(self.shape + inverse) - math.lgamma(self.shape))
+        tail = self.ratio * math.pow(self.shape, inverse)
         return self.scale * ((1 - self.weight) * body + self.weight * tail)
 
     def cdf(self, delay: Floats) -> tuple[Floats, Floats]:
