@@ -44,6 +44,7 @@ NEGLIGIBLE = 6.0  # a height less likely than the best by so much (log) does not
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
 RECENT = 30  # buckets
 MAX_WAITING = 64
+MISSING = (8.0, 16.0)  # arrivals earlier than the earliest, by the law: so many would be missed, and it is another law
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
 COARSE_ERROR = 0.1  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
@@ -317,8 +318,12 @@ def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> Fitn
     upper, _ = law.cdf(distance)
     lower, _ = law.cdf(distance - problem.period)
     kept = np.where(lower < 0.9995, kept, 0.0)  # what was held up elsewhere says nothing about the law
-    misfit = misfit_of(lower, upper, kept, np.mod(distance, problem.period) / problem.period)
+    first = np.mod(distance, problem.period)  # at the first poll after the event
+    misfit = misfit_of(lower, upper, kept, first / problem.period)
     trust = ramp(misfit, 0.025, 0.045) * ramp(law.shape, 5.5, 7.5)  # at the bound it is another law
+    earliest = float(distance[kept > 0].min(initial=np.inf))
+    missing = float(kept @ law.cdf(np.where(first < earliest, first, 0.0))[0])
+    trust *= ramp(missing, *MISSING)
     trust *= ramp(law.mean_ns / problem.period, 0.12, 0.04)  # as good as constant: the lowest points say it better
     if problem.period > COARSE_NS:
         trust *= ramp(law.mean_ns / problem.period, 0.25, 0.1)

@@ -29,6 +29,7 @@ CLEAR = 0.15  # of the spread: a third of a piece further than this above the cu
 GRID_KNOT_S = 20.0
 MIN_POLLED = 0.5  # share of the seconds in which polls are seen, for them to count
 GRID_CURVATURE = 0.02e-6 / S
+STEEPER = np.array([-0.4, 0.2, 0.0, 0.0, 0.4])  # from a gamma law to start from in search of one with a power
 NO_GAMMA = 5.0  # gain of the log posterior by which a law with a power is proven
 JITTER_ERROR = 0.5  # of the polls' jitter: one sigma of where the polls are
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
@@ -231,12 +232,15 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
             break
         problem.count = kept
         best = problem.climb(best.weights, best.law, MANY_STEPS)
-    wider = problem.climb(best.weights, np.append(best.law, 0.0), MANY_STEPS)
-    variance = np.linalg.inv(wider.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
+    near = problem.climb(best.weights, np.append(best.law, 0.0), MANY_STEPS)
+    far = problem.climb(best.weights, np.append(best.law, 0.0) + STEEPER, MANY_STEPS)
+    wider = max(near, far, key=lambda fit: fit.value)
     law_error = 0.0
     if wider.value > best.value + NO_GAMMA:
-        best, found = wider, DelayLaw.of(wider.law)
+        best = near = wider
+        found = DelayLaw.of(best.law)
         law_error = LAW_ERROR * found.shape * max(found.shape, 2.0) * found.mean_ns
+    variance = np.linalg.inv(near.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
     heights = level + best.weights
     curve = Curve(knots_x, heights)
     events_x = np.concatenate([p.events_x for p in points])

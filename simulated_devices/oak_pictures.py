@@ -182,7 +182,7 @@ class PictureMaker:
     def _run(self) -> None:
         looped: list[dict[str, tuple[bytes, bool]]] = []
         for index in range(self._loop):
-            looped.append(self._encoded(self._exposure(self._next), (index,)))
+            looped.append(self._encoded(self._exposure(self._next + index), (index,)))
         first_sent: int | None = None
         while not self._stopped.is_set():
             exposure = self._exposure(self._next)
