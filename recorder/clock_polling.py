@@ -44,7 +44,8 @@ NEGLIGIBLE = 6.0  # a height less likely than the best by so much (log) does not
 FAR_OFF = 2.0  # periods above the lowest point: the last fit is of no use as a start
 RECENT = 30  # buckets
 MAX_WAITING = 64
-MISSING = (8.0, 16.0)  # arrivals earlier than the earliest, by the law: so many would be missed, and it is another law
+MISSING = (4.0, 8.0)  # arrivals earlier than the earliest, by the law: so many would be missed, and it is another law
+CLOSE = 0.3  # sigma of the height: by so much the fit may be too early
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
 COARSE_ERROR = 0.1  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
@@ -204,7 +205,7 @@ class PollingGrid:
         fitted, kept = best
         fitted, weights, sd_height = along_plateau(problem, fitted)
         self._last = _Start(end, *_absolute(fitted.weights, line, end), fitted.law)
-        trust = self._trust(problem, fitted, kept, t)
+        trust = self._trust(problem, fitted, kept, t, sd_height)
         covariance = np.linalg.inv(fitted.information)
         if trust > 0.5:
             self._learn_bending(fitted.weights[2], float(covariance[2, 2]))
@@ -261,9 +262,9 @@ class PollingGrid:
         weight = 0.1 * min(1.0, self._bending / noise)
         self._bending += weight * (min(max(free**2 - noise, least**2), most**2) - self._bending)
 
-    def _trust(self, problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> float:
+    def _trust(self, problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats, sd_ns: float) -> float:
         """How far to believe the fit."""
-        fitness = judge(problem, fitted, kept, t)
+        fitness = judge(problem, fitted, kept, t, sd_ns)
         self._load = max(0.85 * self._load, fitness.load)
         share = float(kept.sum()) / max(float(sum(p.count.sum() for p in self.points)), 1.0)
         return fitness.trust * ramp(self._load, 0.02, 0.04) * min(1.0, share / 0.4)
@@ -311,8 +312,8 @@ class Fitness:
     load: float
 
 
-def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> Fitness:
-    """Test a fit: do the delays follow the law, and the same one throughout?"""
+def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats, sd_ns: float) -> Fitness:
+    """Test a fit: do the delays follow the law, and the same one throughout? sd_ns: one sigma of its height."""
     distance = problem.height - problem.basis @ fitted.weights
     law = DelayLaw.of(fitted.law)
     upper, _ = law.cdf(distance)
@@ -321,7 +322,7 @@ def judge(problem: IntervalFit, fitted: Fitted, kept: Floats, t: Floats) -> Fitn
     first = np.mod(distance, problem.period)  # at the first poll after the event
     misfit = misfit_of(lower, upper, kept, first / problem.period)
     trust = ramp(misfit, 0.025, 0.045) * ramp(law.shape, 5.5, 7.5)  # at the bound it is another law
-    earliest = float(distance[kept > 0].min(initial=np.inf))
+    earliest = float(distance[kept > 0].min(initial=np.inf)) - CLOSE * sd_ns
     missing = float(kept @ law.cdf(np.where(first < earliest, first, 0.0))[0])
     trust *= ramp(missing, *MISSING)
     trust *= ramp(law.mean_ns / problem.period, 0.12, 0.04)  # as good as constant: the lowest points say it better

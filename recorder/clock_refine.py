@@ -246,13 +246,18 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
     events_x = np.concatenate([p.events_x for p in points])
     gap = widest_gap(events_x - events_x[0] + curve.at(events_x), true_period)
     jitter = JITTER_ERROR * float(np.median([p.jitter_ns for p in points]))
-    sigma = math.hypot(math.sqrt(max(float(np.median(variance)), 0.0)), law_error, jitter, GAP_SIGMA * gap)
+    sd_ns = math.sqrt(max(float(np.median(variance)), 0.0))
+    sigma = math.hypot(sd_ns, law_error, jitter, GAP_SIGMA * gap)
     lowest = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
-    return replace(curve, sigma_ns=sigma), _trust(problem, best, at_x, points), math.hypot(lowest, GAP_SIGMA * gap)
+    return (
+        replace(curve, sigma_ns=sigma),
+        _trust(problem, best, at_x, points, sd_ns),
+        math.hypot(lowest, GAP_SIGMA * gap),
+    )
 
 
-def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints]) -> float:
-    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S)
+def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints], sd_ns: float) -> float:
+    fitness = judge(problem, fitted, problem.count, (x - x[0]) / S, sd_ns)
     if on_coarser_grid(np.sum([p.residues for p in points], axis=0)):
         return 0.0
     return fitness.trust * ramp(fitness.load, 0.02, 0.04)
