@@ -374,11 +374,15 @@ class _Decoding:
         return f"{told}; {survey(capture.path).text()}" if capture.has_arrivals else told
 
 
+LONGEST_GAP_S = 86_400
+
+
 @dataclass(slots=True)
 class _DeviceTime:
     """Arrivals of samples that have none: as the device's own clock says.
 
-    Its time runs on over a wrap; where it steps back (the device started anew) it goes on from where it was.
+    Its time runs on over a wrap; where it steps back (the device started anew), or on by more than a day (it is
+    broken), it goes on from where it was.
     """
 
     tick_hz: float
@@ -396,7 +400,8 @@ class _DeviceTime:
                 step %= 1 << self.wrap_bits
                 step = 0 if step >> (self.wrap_bits - 1) else step
             self._last_ticks = ticks
-            self._elapsed += max(0, step)
+            if 0 < step < LONGEST_GAP_S * self.tick_hz:
+                self._elapsed += step
         return self.begin_ns + round(self._elapsed * NS_PER_S / self.tick_hz)
 
 

@@ -62,6 +62,9 @@ class DeviceInTake:
     last_picture_ns: int = -1
 
 
+MOST_TICKS = (1 << 63) - 1  # of a row; a broken counter may show more, and its line keeps the time given online
+
+
 @dataclass(slots=True)
 class _ClockTable:
     """Rows of a device's clock table (see recorder.recording.raw) since they were last taken."""
@@ -75,7 +78,7 @@ class _ClockTable:
         if isinstance(sample, ScanSample):
             if stamped.scan_knots is not None:
                 self.batches.append(scan_rows(stamped.scan_knots - np.array([0, start_ns]), time_ns))
-        elif sample.device_ticks is not None:
+        elif sample.device_ticks is not None and abs(sample.device_ticks) <= MOST_TICKS:
             self.rows.extend((sample.device_ticks, stamped.arrival_ns, time_ns))
 
     def taken(self) -> list[npt.NDArray[np.int64]]:

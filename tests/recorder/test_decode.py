@@ -16,10 +16,15 @@ from recorder.cli import main
 from recorder.decode import decode
 from recorder.errors import ConfigError, RecorderError, StorageError
 from recorder.recording.raw import NONE, RawWriter
+from simulated_devices.vectornav import crc16
 
 START_S = 1_700_000_000
 LIDAR = ("192.168.1.200", 6699)
 PACKETS = 30
+# Of a binary VectorNav message, after its time: attitude, rates, acceleration, and magnetometer, temperature, pressure.
+VECTORNAV_REST = bytes.fromhex(
+    "0AD7233C0AD7A3BC8FC2F53CCDCCCC3DCDCC4CBE0AE81CC10000803ECDCCCCBDCDCCCC3E0000FC4166A6CA42"
+)
 NMEA = Path(__file__).parent.parent / "data" / "nmea" / "rx210.log"
 
 
@@ -283,3 +288,16 @@ def test_stopping_finishes_what_has_been_read(tmp_path: Path) -> None:
     assert decoded.manifest.stopped_by == "interrupt"
     assert decoded.manifest.state == "complete"
     assert 0 < len((tmp_path / "out" / "data.jsonl").read_text().splitlines()) < 20
+
+
+def test_a_counter_that_shows_more_than_63_bits_ends_no_recording(tmp_path: Path) -> None:
+    frames = []
+    for number in range(200):
+        time_ns = (1 << 64) - 1 - number if number in (50, 120, 121, 122) else number * 5_000_000
+        body = bytes.fromhex("012105") + struct.pack("<Q", time_ns) + VECTORNAV_REST
+        frames.append(b"\xfa" + body + struct.pack(">H", crc16(body)))
+    (tmp_path / "imu.bin").write_bytes(b"".join(frames))
+    decoding = Decoding(tmp_path / "imu.bin", "vectornav", tmp_path / "out")
+    lines = (tmp_path / "out" / "data.jsonl").read_text().splitlines()
+    assert sum('"gyroscope"' in line for line in lines) == 200
+    assert decoding.manifest.state == "complete"
