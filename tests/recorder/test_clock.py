@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from recorder.clock import ClockMap, refine, refine_all, stored_sigma_ppm
 from recorder.clock_fit import Level
-from recorder.clock_grid import GridTracker
+from recorder.clock_grid import DelayLaw, GridTracker
 
 BOOT_NS = 250_000 * 10**9
 MS = 1_000_000
@@ -139,6 +139,38 @@ def test_refined_times_lie_by_the_law_or_on_the_lowest_arrival() -> None:
     assert 0 <= above_us["lowest"] < 5 < above_us["model"] < 100
 
 
+def redelayed(t: Trace, delay_ms: np.ndarray) -> Trace:
+    """The same samples with other delays, polled each ms by a host clock 7 ppm off."""
+    frame_s = 1e-3 * (1 + 7e-6)
+    arrival_s = np.ceil(((t.true_ns - BOOT_NS) * 1e-9 + delay_ms * 1e-3) / frame_s) * frame_s
+    return Trace(t.true_ns, t.ticks, np.maximum.accumulate((arrival_s * 1e9).astype(np.int64)) + BOOT_NS)
+
+
+@pytest.mark.parametrize("law", ["weibull", "fast path"])
+def test_refined_times_are_right_where_no_gamma_law_is(law: str) -> None:
+    """A gamma law would put the floor 70 µs too early, or 160 µs where one sample in twenty takes a path of its own."""
+    t, rng = trace(duration_s=240.0), np.random.default_rng(4)
+    size = t.ticks.size
+    weibull = 0.8 * rng.weibull(1.5, size)
+    two_paths = np.where(rng.random(size) < 0.05, 0.0, 0.3 + rng.gamma(2.0, 0.35, size))
+    t = redelayed(t, weibull if law == "weibull" else two_paths)
+    refined = refine_all(t.ticks, t.arrival_ns, 1e6)
+    errors_us = np.abs(refined.host_ns - t.true_ns) / 1e3
+    assert np.sqrt(np.mean(errors_us**2)) < 30
+    assert np.mean(errors_us < 2 * refined.sigma_ns / 1e3) > 0.95
+
+
+def test_the_delay_laws_derivatives_are_those_of_its_distribution() -> None:
+    delay_ns = np.linspace(5e4, 5e6, 100)
+    for law in ([0.8, 12.7, -2.5, 0.7], [0.8, 12.7, -2.5, 0.7, 0.3]):
+        value, slopes = DelayLaw.of(np.array(law)).cdf(delay_ns)
+        assert (np.diff(value) >= 0).all()
+        for index, by_parameter in enumerate(slopes[1:]):
+            step = 1e-4 * (np.arange(len(law)) == index)
+            above, below = (DelayLaw.of(np.array(law) + sign * step).cdf(delay_ns)[0] for sign in (1, -1))
+            assert np.abs((above - below) / 2e-4 - by_parameter).max() < 0.03
+
+
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0])
 def test_polls_are_told_from_the_samples_own_rhythm(rate_hz: float) -> None:
     """All samples come at whole 10 ms of the device's clock, and most of them on each tenth poll, too."""
@@ -165,7 +197,10 @@ def test_a_controllers_polls_are_known_from_another_device(poll_ms: float) -> No
     shared = np.array([stamp for clock, stamp in stamps if clock is clocks[1]])
     assert_causal(shared, second)
     if poll_ms:
+        without_polls = second.mapped(ClockMap(1e6, use_grid=False))
         assert (shared != alone).any()
+        assert rms_us(shared, second, after_s=5.0) < 0.7 * rms_us(without_polls, second, after_s=5.0)
+        assert rms_us(shared, second, after_s=5.0) < 260  # alone it finds them nearly as soon
         assert rms_us(shared, second, after_s=2.0) < 1.2 * rms_us(alone, second, after_s=2.0)
     else:
         assert (shared == alone).all()
