@@ -31,9 +31,8 @@ BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
 IGNORE_TRUST, MIN_TRUST = 0.3, 0.5
 GRID_LEVEL = 0.008
-HEIGHT_SIGMA = 0.7  # of the usual height of the lowest arrivals above the floor
-LAW_ERROR = 0.02  # of the mean delay times the law's shape: one sigma of the place of the floor under a fitted law
-CLEARANCE_ERROR = 0.6  # of the height above the place by the delay law
+HEIGHT_SIGMA = 1.2  # of the usual height of the lowest arrivals above the floor
+LAW_ERROR, SHAPE_ERROR = 0.04, 0.02  # one sigma of the floor: of the mean delay, of that times the fitted law's shape
 REFIT_S = 2.0
 SLEW = ((5.0, 0.2), (30.0, 5e-3), (math.inf, 500 * PPM))  # up to this age of the epoch: seconds per second
 KEPT_SKEW_PPM = 2.0  # one sigma of a device's skew across a restart
@@ -100,7 +99,7 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now
     level "lowest": the curve is moved to touch the lowest point, but not further above the place where the delay law
     puts it than that may be wrong; "model": it lies there.
     """
-    law_error = LAW_ERROR * grid.law.shape * grid.law.mean_ns
+    law_error = max(LAW_ERROR, SHAPE_ERROR * grid.law.shape) * grid.law.mean_ns
     unsure = math.hypot(line.sigma_ns(now_x), 0.02 * grid.sd_curvature * (now_x - buckets[0].last_x) ** 2)
     trust = grid.trust / (1 + (grid.sd_height / max(unsure, 1.0)) ** 4)
     if grid.trust < IGNORE_TRUST:
@@ -117,7 +116,7 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now
     here = trust * float(grid.at(np.array([now_x]))[0]) + (1 - trust) * line.at(now_x) + clearance
     slope = trust * (grid.slope + 2 * grid.curvature * (now_x - grid.pivot_x)) + (1 - trust) * line.slope
     sd_slope = trust * grid.sd_slope + (1 - trust) * line.sd_slope
-    unsure = math.hypot(grid.sd_height, law_error, CLEARANCE_ERROR * max(clearance, 0.0))
+    unsure = math.hypot(grid.sd_height, law_error, max(clearance, 0.0))
     sd_level = trust * unsure + (1 - trust) * line.sigma_ns(now_x)
     return Line(float(here - slope * now_x), float(slope), float(sd_slope), float(sd_level), now_x, line.spread_ns)
 

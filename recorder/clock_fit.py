@@ -35,7 +35,9 @@ SHRINK = 0.6
 LEAST_DOUBT = 1e-6  # arrivals without any jitter leave none, and a weight must stay finite
 BLOCKS = 12
 UNSTEADY = 7.0
-UNSTEADY_LEVEL = 0.2
+UNSTEADY_LEVEL = 0.42
+SEEN_MINUTES = 3.0  # a floor that wanders has been seen to return after so long, and is then known by so much better
+SEEN = 0.35
 TOUCHING = 1.4
 LEVEL = 0.45  # error of the level by that of slope times span
 HIDDEN_LEVEL = 0.3
@@ -210,7 +212,7 @@ def blend(buckets: list[Bucket], prior: SlopePrior, hides: Hides | None = None) 
         line, clear, wander = _blend_window(table, prior, pivot, hides, wander)
         span = float(table[-1, 6] - table[0, 0])
         if not clear or span < FIRST_WINDOW_S * S:
-            return line
+            return line if hides is not None else _surer_by_waves(line, table)
         table = table[table[:, 6] >= pivot - SHRINK * span]
         sigma = math.hypot(line.sd_slope, DRIFT * span)
         if sigma < prior.sigma:
@@ -285,9 +287,24 @@ def touching_error(height: Floats, pieces: int = 1) -> tuple[float, float]:
     return usual, usual * (BLOCKS * pieces / low.size) ** 1.7
 
 
+def _waves(usual: float, spread: float) -> float:
+    """Whether the floor itself moves slowly, 0 to 1: hardly, where the lowest points lie close to the line."""
+    return math.pow(min(UNSTEADY * usual / spread, 1.0), 4)
+
+
 def _unsteadiness(usual: float, spread: float, minutes: float) -> float:
-    """How far the floor itself may move slowly, in spreads: hardly, where the lowest points lie close to the line."""
-    return 4.0 * math.pow(min(UNSTEADY * usual / spread, 1.0), 4) / (1 + minutes)
+    """How far the floor itself may move slowly, in spreads."""
+    return 4.0 * _waves(usual, spread) / (1 + minutes)
+
+
+def _surer_by_waves(line: Line, table: Floats) -> Line:
+    """The line with smaller errors where a wandering floor has been seen to come down to it again and again."""
+    low_x, low_y = table[:, 0], table[:, 1]
+    usual, _ = touching_error(low_y - line.slope * low_x)
+    minutes = float(low_x[-1] - low_x[0]) / (60 * S)
+    surer = max(SEEN, 1 / (1 + (minutes / SEEN_MINUTES) ** 4))
+    factor = 1 - _waves(usual, line.spread_ns) * (1 - surer)
+    return replace(line, sd_slope=factor * line.sd_slope, sd_level_ns=factor * line.sd_level_ns)
 
 
 def _slope_room(x: Floats, above: Floats, lowest: int) -> float:
