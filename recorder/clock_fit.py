@@ -35,9 +35,10 @@ SHRINK = 0.6
 LEAST_DOUBT = 1e-6  # arrivals without any jitter leave none, and a weight must stay finite
 BLOCKS = 12
 UNSTEADY = 7.0
-UNSTEADY_LEVEL = 0.42
+UNSTEADY_LEVEL = 0.17
 SEEN_MINUTES = 3.0  # a floor that wanders has been seen to return after so long, and is then known by so much better
 SEEN = 0.35
+FEW = 0.8  # of the spread by the root of the samples in a block: their usual least height, for gamma laws of shape 2
 TOUCHING = 1.4
 LEVEL = 0.45  # error of the level by that of slope times span
 HIDDEN_LEVEL = 0.3
@@ -272,7 +273,7 @@ def _blend_window(
     usual, unsure = touching_error(height)
     level = math.hypot(LEVEL * unsure, HIDDEN_LEVEL * hidden.level_ns, 0.001 * spread)
     if hides is None:
-        level = math.hypot(level, UNSTEADY_LEVEL * _unsteadiness(usual, spread, minutes) * spread / (1 + minutes))
+        level = math.hypot(level, UNSTEADY_LEVEL * _unsteadiness(usual, spread, minutes) * spread)
     return Line(float(height[lowest]), slope, sd_slope, level, float(low_x[lowest]), spread), clear, wander
 
 
@@ -289,7 +290,7 @@ def touching_error(height: Floats, pieces: int = 1) -> tuple[float, float]:
 
 def _waves(usual: float, spread: float) -> float:
     """Whether the floor itself moves slowly, 0 to 1: hardly, where the lowest points lie close to the line."""
-    return math.pow(min(UNSTEADY * usual / spread, 1.0), 4)
+    return math.pow(min(max(UNSTEADY * usual / spread, 0.0), 1.0), 4)
 
 
 def _unsteadiness(usual: float, spread: float, minutes: float) -> float:
@@ -301,6 +302,7 @@ def _surer_by_waves(line: Line, table: Floats) -> Line:
     """The line with smaller errors where a wandering floor has been seen to come down to it again and again."""
     low_x, low_y = table[:, 0], table[:, 1]
     usual, _ = touching_error(low_y - line.slope * low_x)
+    usual -= FEW * line.spread_ns / math.sqrt(float(table[:, 5].sum()) / BLOCKS)
     minutes = float(low_x[-1] - low_x[0]) / (60 * S)
     surer = max(SEEN, 1 / (1 + (minutes / SEEN_MINUTES) ** 4))
     factor = 1 - _waves(usual, line.spread_ns) * (1 - surer)

@@ -46,7 +46,8 @@ RECENT = 30  # buckets
 MAX_WAITING = 64
 MISSING = (4.0, 8.0)  # arrivals earlier than the earliest, by the law: so many would be missed, and it is another law
 CLOSE = 0.3  # sigma of the height: by so much the fit may be too early
-UNSEEN_S = 200.0  # by then most clocks have slid over a poll; what looks like polls may be the device's own rhythm
+UNSEEN_S = 200.0  # by then most clocks have slid over a poll
+OWN_RHYTHM_NS = 1.5e6  # what looks like polls as slow as this may well be the device's own rhythm
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
 COARSE_ERROR = 0.1  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
@@ -158,7 +159,11 @@ class PollingGrid:
         jitter = float(np.median([p.jitter_ns for p in self.points[-RECENT:]])) if self.points else 0.0
         if not STEADIEST * period < jitter < LOOSEST * period:
             return 0.0
-        return 0.0 if self._real else period / math.sqrt(3) * math.exp(-age_s / UNSEEN_S)
+        if self._real:
+            return 0.0
+        if period > OWN_RHYTHM_NS:
+            return period / math.sqrt(12) * math.exp(-age_s / (0.3 * UNSEEN_S))
+        return period / math.sqrt(3) * math.exp(-age_s / UNSEEN_S)
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:
         """Take note of a bucket's samples."""
