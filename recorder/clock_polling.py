@@ -47,7 +47,6 @@ MAX_WAITING = 64
 MISSING = (4.0, 8.0)  # arrivals earlier than the earliest, by the law: so many would be missed, and it is another law
 CLOSE = 0.3  # sigma of the height: by so much the fit may be too early
 UNSEEN_S = 200.0  # by then most clocks have slid over a poll
-OWN_RHYTHM_NS = 1.5e6  # what looks like polls as slow as this may well be the device's own rhythm
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
 COARSE_ERROR = 0.1  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
@@ -152,17 +151,13 @@ class PollingGrid:
     def unseen_ns(self, age_s: float) -> float:
         """One sigma of the height above the floor that the polls may hide from a line under the arrivals.
 
-        Until a sample's phase has slid over the edge of a poll, anything within a period is possible; a slow period
-        is a latency timer on top of finer polls, whose beat against it is slow.
+        Until a sample's phase has slid over the edge of a poll, anything within a period is possible; or it is the
+        device's own rhythm.
         """
         period = self.tracker.period_ns
         jitter = float(np.median([p.jitter_ns for p in self.points[-RECENT:]])) if self.points else 0.0
-        if not STEADIEST * period < jitter < LOOSEST * period:
+        if self._real or not STEADIEST * period < jitter < LOOSEST * period:
             return 0.0
-        if self._real:
-            return 0.0
-        if period > OWN_RHYTHM_NS:
-            return period / math.sqrt(12) * math.exp(-age_s / (0.3 * UNSEEN_S))
         return period / math.sqrt(3) * math.exp(-age_s / UNSEEN_S)
 
     def feed(self, x: Floats, y: Floats, slope: float) -> None:

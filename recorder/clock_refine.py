@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_fit import LEVEL, MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
+from recorder.clock_fit import MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
 from recorder.clock_grid import GAMMA, LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
-from recorder.clock_polling import judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
+from recorder.clock_polling import COARSE_NS, judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
 
 Ints = NDArray[np.int64]
 
@@ -31,16 +31,21 @@ MIN_POLLED = 0.5  # share of the seconds in which polls are seen, for them to co
 GRID_CURVATURE = 0.02e-6 / S
 STEEPER = np.array([-0.4, 0.2, 0.0, 0.0, 0.4])  # from a gamma law to start from in search of one with a power
 NO_GAMMA = 20.0  # gain of the log posterior by which a law with a power is proven
-JITTER_ERROR = 0.5  # of the polls' jitter: one sigma of where the polls are
+JITTER_ERROR = 0.25  # of the polls' jitter: one sigma of where the polls are
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
 ROUNDS = 4
 FEW_STEPS, MANY_STEPS = 12, 40
 CHUNK_ARRIVALS = 40
 FREE = 1e-20
-ARRIVAL_NS = 100.0  # how well an arrival can be stamped at best
+ARRIVAL_NS = 250.0  # how well an arrival can be stamped at best
 LOWEST = 1.0  # of the median delay by the root of their number: how late the quickest is, for gamma laws of shape 2
+FEW_LOWEST = 20
+FEW_ERROR = 0.15  # of the mean delay: by which the square of the usual lowest arrival is what few samples leave open
+BEATS, SWEPT = 1.5, 0.33  # once the samples have slid over the polls so often the envelope is known by so much better
+LEVEL = 0.38  # error of the envelope's level by that of slope times span
+COARSE_LEVEL = 0.012  # of the period of a latency timer: how far its beat with finer polls moves the floor
 GAP_SIGMA = 0.5  # of the gap between the samples' phases that may hide the floor
-LAW_ERROR = 0.008  # of the mean delay times the law's shape, times the shape again but at least 2: see docs/clocks.md
+LAW_ERROR = 0.012  # of the mean delay times the law's shape, times the shape again but at least 2: see docs/clocks.md
 CURVATURE = 0.08e-6 / S  # one sigma of the change of slope, per ns
 NOMINAL = SlopePrior(0.0, 100 * PPM)  # where most of an epoch came as a backlog
 
@@ -199,9 +204,7 @@ def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], f
 def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -> tuple[Curve, float, float] | None:
     """The offset by the likelihood of the polls (`recorder.clock_grid`) near the envelope, and how far to trust it.
 
-    Third, one sigma of the height above the floor at which the polls leave the envelope: with n delays that begin like
-    a gamma law of shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less than d late; and anything
-    within the widest gap of the samples' phases against the polls is possible.
+    Third, one sigma of the envelope's height above the floor, now that the polls are known.
     """
     slope = float((beneath.heights[-1] - beneath.heights[0]) / (beneath.knots_x[-1] - beneath.knots_x[0]))
     points, period, true_period = grid_points(x, y, slope)
@@ -244,16 +247,34 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
     heights = level + best.weights
     curve = Curve(knots_x, heights)
     events_x = np.concatenate([p.events_x for p in points])
-    gap = widest_gap(events_x - events_x[0] + curve.at(events_x), true_period)
+    event = events_x - events_x[0] + curve.at(events_x)
+    gap = widest_gap(event, true_period)
     jitter = JITTER_ERROR * float(np.median([p.jitter_ns for p in points]))
     sd_ns = math.sqrt(max(float(np.median(variance)), 0.0))
-    sigma = math.hypot(sd_ns, law_error, jitter, GAP_SIGMA * gap)
-    lowest = (1.5 * max(mean, 0.0) ** 2 * period / max(float(count.sum()), 1.0)) ** (1 / 3)
-    return (
-        replace(curve, sigma_ns=sigma),
-        _trust(problem, best, at_x, points, sd_ns),
-        math.hypot(lowest, GAP_SIGMA * gap),
-    )
+    few = usual_low_ns(x.size, period, mean) ** 2 / (FEW_ERROR * mean)
+    sigma = math.hypot(sd_ns, few, law_error, jitter, GAP_SIGMA * gap)
+    unseen = gap if period >= COARSE_NS else period - float(np.mod(np.maximum(height, 0.0), period).max())
+    coarse = COARSE_LEVEL * period if period >= COARSE_NS else 0.0
+    swept = SWEPT if beats(event, true_period) > BEATS else 1.0
+    lowest = np.partition(y - beneath.at(x), min(FEW_LOWEST, x.size - 1))[: FEW_LOWEST + 1]
+    low_ns = min(usual_low_ns(x.size, period, mean), float(np.ptp(lowest)))
+    sd_beneath = math.hypot(swept * beneath.sigma_ns, low_ns, GAP_SIGMA * unseen, coarse)
+    return replace(curve, sigma_ns=sigma), _trust(problem, best, at_x, points, sd_ns), sd_beneath
+
+
+def beats(event: Floats, period: float) -> float:
+    """How often the samples have slid over all of the period."""
+    step = np.diff(event % period)
+    return abs(float((step - np.rint(step / period) * period).sum())) / period
+
+
+def usual_low_ns(samples: int, period: float, mean_ns: float) -> float:
+    """How far above the floor the lowest arrivals usually are when they had to wait for a poll.
+
+    With n delays that begin like a gamma law of shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less
+    than d late.  Of laws that begin steeply more are, and the lowest lie closer together than that.
+    """
+    return math.cbrt(1.5 * mean_ns**2 * period / samples)
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints], sd_ns: float) -> float:
@@ -294,11 +315,11 @@ def _refine_piece(x: Floats, y: Floats, prior: SlopePrior | None, level: Level) 
     found = grid_curve(x, y, beneath, prior)
     if found is None:
         return beneath
-    curve, trust, hidden_ns = found
+    curve, trust, sd_beneath_ns = found
     if level == "lowest":
         raised = curve.heights + float((y - curve.at(x)).min())
-        curve = Curve(curve.knots_x, raised, math.hypot(beneath.sigma_ns, hidden_ns))
-    beneath = replace(beneath, sigma_ns=math.hypot(beneath.sigma_ns, hidden_ns))
+        curve = Curve(curve.knots_x, raised, sd_beneath_ns)
+    beneath = replace(beneath, sigma_ns=sd_beneath_ns)
     knots_x = np.union1d(curve.knots_x, beneath.knots_x)
     heights = trust * curve.at(knots_x) + (1 - trust) * beneath.at(knots_x)
     return Curve(knots_x, heights, trust * curve.sigma_ns + (1 - trust) * beneath.sigma_ns)
