@@ -49,8 +49,9 @@ CLOSE = 0.3  # sigma of the height: by so much the fit may be too early
 UNSEEN_S = 200.0  # by then most clocks have slid over a poll
 WIDE = 8.0  # the delays must spread over this many times the jitter of the polls
 BLOCK_S = 5.0
-COARSE_ERROR = 0.1  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
+COARSE_ERROR = 0.09  # of the period: how far the beat of finer polls moves the floor, and three sigma of it
 STEADIEST, LOOSEST = 0.003, 0.015  # jitter of polls in periods; else it may be the device's own rhythm
+COARSE_GAP = 1.7  # by so much more the floor may be hidden in a gap when finer polls move it, too
 COARSE_NS = 4e6  # a latency timer this slow stands on a finer grid, which shows unless the delays are longer still
 
 
@@ -136,16 +137,20 @@ class PollingGrid:
 
         def hidden(slope: float) -> Hidden:
             gap = widest_gap(events_x * (1 + slope), period)
-            return Hidden(gap, gap) if period < COARSE_NS else Hidden(max(gap, COARSE_ERROR * period), period)
+            return (
+                Hidden(gap, gap) if period < COARSE_NS else Hidden(max(COARSE_GAP * gap, COARSE_ERROR * period), period)
+            )
 
         return hidden
 
     def height_ns(self, samples: float, spread_ns: float) -> float:
-        """How far above the floor the lowest of so many polled arrivals usually is; 0 without polls.
+        """How far above the floor the lowest of so many polled arrivals usually is; 0 without polls or with slow ones.
 
         Of delays that begin like a gamma law of shape 2 and scale s, samples * d^3 / (6 s^2 period) are less than d
         late when they are seen.
         """
+        if self.period_ns >= COARSE_NS:
+            return 0.0  # `hides` says more of latency timers
         return math.cbrt(1.5 * spread_ns**2 * self.period_ns / max(samples, 1.0))
 
     def unseen_ns(self, age_s: float) -> float:
