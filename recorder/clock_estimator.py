@@ -31,6 +31,7 @@ BUCKET_SAMPLES = 100  # a bucket with fewer waits up to the longest
 WINDOW_S = 600
 IGNORE_TRUST, MIN_TRUST = 0.3, 0.5
 GRID_LEVEL = 0.008
+GAP_SIGMA = 0.25  # of the gap between the samples' phases, in which only the fitted law tells the floor
 HEIGHT_SIGMA = 1.2  # of the usual height of the lowest arrivals above the floor
 LAW_ERROR, SHAPE_ERROR = 0.04, 0.02  # one sigma of the floor: of the mean delay, of that times the fitted law's shape
 REFIT_S = 2.0
@@ -93,11 +94,11 @@ class Counts:
     epochs: int = 0
 
 
-def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now_x: float) -> Line:
+def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now_x: float, gap_ns: float) -> Line:
     """The tangent at `now_x` of the grid's curve and the line beneath, mixed by trust.
 
     level "lowest": the curve is moved to touch the lowest point, but not further above the place where the delay law
-    puts it than that may be wrong; "model": it lies there.
+    puts it than that may be wrong; "model": it lies there. gap_ns: of the samples' phases against the polls.
     """
     law_error = max(LAW_ERROR, SHAPE_ERROR * grid.law.shape) * grid.law.mean_ns
     unsure = math.hypot(line.sigma_ns(now_x), 0.02 * grid.sd_curvature * (now_x - buckets[0].last_x) ** 2)
@@ -116,7 +117,7 @@ def combine(line: Line, grid: GridLine, buckets: list[Bucket], level: Level, now
     here = trust * float(grid.at(np.array([now_x]))[0]) + (1 - trust) * line.at(now_x) + clearance
     slope = trust * (grid.slope + 2 * grid.curvature * (now_x - grid.pivot_x)) + (1 - trust) * line.slope
     sd_slope = trust * grid.sd_slope + (1 - trust) * line.sd_slope
-    unsure = math.hypot(grid.sd_height, law_error, max(clearance, 0.0))
+    unsure = math.hypot(grid.sd_height, law_error, max(clearance, 0.0), GAP_SIGMA * gap_ns)
     sd_level = trust * unsure + (1 - trust) * line.sigma_ns(now_x)
     return Line(float(here - slope * now_x), float(slope), float(sd_slope), float(sd_level), now_x, line.spread_ns)
 
@@ -348,10 +349,11 @@ class Estimator:
             line = blend(buckets, prior, self.grid.hides if self.grid is not None else None)
             if self.grid is not None:
                 line = line.less_sure(self.grid.unseen_ns(self._age_s()))
-            self.grid_line = self.grid.fit(line, prior) if self.grid is not None else None
-            if self.grid_line is not None:
-                line = combine(line, self.grid_line, buckets, self.level, self.last_x)
-            if self.grid is not None:
+                self.grid_line = self.grid.fit(line, prior)
+                hides = self.grid.hides
+                if self.grid_line is not None and hides is not None:
+                    gap_ns = hides(self.grid_line.slope).level_ns
+                    line = combine(line, self.grid_line, buckets, self.level, self.last_x, gap_ns)
                 samples = sum(bucket.samples for bucket in buckets)
                 line = line.less_sure(HEIGHT_SIGMA * self.grid.height_ns(samples, line.spread_ns))
             self._ready = (epoch, line)
