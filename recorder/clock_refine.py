@@ -225,8 +225,31 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
     problem = IntervalFit(basis, height, count, period, slope * knots_x - level, precision)
     low = float(height.min())
     mean = max(float(count @ height / count.sum()) - low - 0.5 * period, 0.1 * period)
+    best, information, law_error = _most_likely(problem, bucket, low, mean)
+    curve = Curve(knots_x, level + best.weights)
+    events_x = np.concatenate([p.events_x for p in points])
+    event = events_x - events_x[0] + curve.at(events_x)
+    gap = widest_gap(event, true_period)
+    jitter = JITTER_ERROR * float(np.median([p.jitter_ns for p in points]))
+    variance = np.linalg.inv(information).diagonal()[: knots_x.size]
+    sd_ns = math.sqrt(max(float(np.median(variance)), 0.0))
+    usual_low = usual_low_ns(x.size, period, mean)
+    few = usual_low**2 / (FEW_ERROR * mean)
+    sigma = math.hypot(sd_ns, few, law_error, jitter, GAP_SIGMA * gap)
+    # what is left of the envelope's own error
+    unseen = gap if period >= COARSE_NS else period - float(np.mod(np.maximum(height, 0.0), period).max())
+    coarse = COARSE_LEVEL * period if period >= COARSE_NS else 0.0
+    swept = SWEPT if beats(event, true_period) > BEATS else 1.0
+    lowest = np.partition(y - beneath.at(x), min(FEW_LOWEST, x.size - 1))[: FEW_LOWEST + 1]
+    sd_beneath = math.hypot(swept * beneath.sigma_ns, min(usual_low, float(np.ptp(lowest))), GAP_SIGMA * unseen, coarse)
+    return replace(curve, sigma_ns=sigma), _trust(problem, best, at_x, points, sd_ns), sd_beneath
+
+
+def _most_likely(problem: IntervalFit, bucket: Ints, low: float, mean: float) -> tuple[Fitted, Floats, float]:
+    """The best maximum, late buckets left out; the information with a power in the law; the law's own error, ns."""
+    count, period, knots = problem.count, problem.period, problem.basis.shape[1]
     law = LAW_PRIOR[:GAMMA] + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
-    fits = [problem.climb(np.full(knots_x.size, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
+    fits = [problem.climb(np.full(knots, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
     best = max(fits, key=lambda fit: fit.value)
     best = problem.climb(best.weights, best.law, MANY_STEPS)
     for _ in range(ROUNDS):
@@ -238,28 +261,10 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
     near = problem.climb(best.weights, np.append(best.law, 0.0), MANY_STEPS)
     far = problem.climb(best.weights, np.append(best.law, 0.0) + STEEPER, MANY_STEPS)
     wider = max(near, far, key=lambda fit: fit.value)
-    law_error = 0.0
-    if wider.value > best.value + NO_GAMMA:
-        best = near = wider
-        found = DelayLaw.of(best.law)
-        law_error = LAW_ERROR * found.shape * max(found.shape, 2.0) * found.mean_ns
-    variance = np.linalg.inv(near.information)[np.arange(knots_x.size), np.arange(knots_x.size)]
-    heights = level + best.weights
-    curve = Curve(knots_x, heights)
-    events_x = np.concatenate([p.events_x for p in points])
-    event = events_x - events_x[0] + curve.at(events_x)
-    gap = widest_gap(event, true_period)
-    jitter = JITTER_ERROR * float(np.median([p.jitter_ns for p in points]))
-    sd_ns = math.sqrt(max(float(np.median(variance)), 0.0))
-    few = usual_low_ns(x.size, period, mean) ** 2 / (FEW_ERROR * mean)
-    sigma = math.hypot(sd_ns, few, law_error, jitter, GAP_SIGMA * gap)
-    unseen = gap if period >= COARSE_NS else period - float(np.mod(np.maximum(height, 0.0), period).max())
-    coarse = COARSE_LEVEL * period if period >= COARSE_NS else 0.0
-    swept = SWEPT if beats(event, true_period) > BEATS else 1.0
-    lowest = np.partition(y - beneath.at(x), min(FEW_LOWEST, x.size - 1))[: FEW_LOWEST + 1]
-    low_ns = min(usual_low_ns(x.size, period, mean), float(np.ptp(lowest)))
-    sd_beneath = math.hypot(swept * beneath.sigma_ns, low_ns, GAP_SIGMA * unseen, coarse)
-    return replace(curve, sigma_ns=sigma), _trust(problem, best, at_x, points, sd_ns), sd_beneath
+    if wider.value <= best.value + NO_GAMMA:
+        return best, near.information, 0.0
+    found = DelayLaw.of(wider.law)
+    return wider, wider.information, LAW_ERROR * found.shape * max(found.shape, 2.0) * found.mean_ns
 
 
 def beats(event: Floats, period: float) -> float:
