@@ -247,9 +247,9 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
 
 def _most_likely(problem: IntervalFit, bucket: Ints, low: float, mean: float) -> tuple[Fitted, Floats, float]:
     """The best maximum, late buckets left out; the information with a power in the law; the law's own error, ns."""
-    count, period, knots = problem.count, problem.period, problem.basis.shape[1]
+    count, period, size = problem.count, problem.period, problem.basis.shape[1]
     law = LAW_PRIOR[:GAMMA] + np.array([0.0, np.log(mean / 1.5), 0.0, 0.0])
-    fits = [problem.climb(np.full(knots, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
+    fits = [problem.climb(np.full(size, low - share * period), law, FEW_STEPS) for share in GRID_STARTS]
     best = max(fits, key=lambda fit: fit.value)
     best = problem.climb(best.weights, best.law, MANY_STEPS)
     for _ in range(ROUNDS):
