@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.clock_fit import MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
+from recorder.clock_fit import BLOCKS, FEW, MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
 from recorder.clock_grid import GAMMA, LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
 from recorder.clock_polling import COARSE_NS, judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
 
@@ -31,7 +31,7 @@ MIN_POLLED = 0.5  # share of the seconds in which polls are seen, for them to co
 GRID_CURVATURE = 0.02e-6 / S
 STEEPER = np.array([-0.4, 0.2, 0.0, 0.0, 0.4])  # from a gamma law to start from in search of one with a power
 NO_GAMMA = 20.0  # gain of the log posterior by which a law with a power is proven
-JITTER_ERROR = 0.25  # of the polls' jitter: one sigma of where the polls are
+JITTER_ERROR = 0.1  # of the polls' jitter: one sigma of where the polls are
 GRID_STARTS = (0.05, 0.3, 0.6)  # of the period below the envelope
 ROUNDS = 4
 FEW_STEPS, MANY_STEPS = 12, 40
@@ -40,9 +40,10 @@ FREE = 1e-20
 ARRIVAL_NS = 250.0  # how well an arrival can be stamped at best
 LOWEST = 1.0  # of the median delay by the root of their number: how late the quickest is, for gamma laws of shape 2
 FEW_LOWEST = 20
-FEW_ERROR = 0.15  # of the mean delay: by which the square of the usual lowest arrival is what few samples leave open
+BIAS = 300.0  # of the mean delay, by the number of samples: how wrong the place by the law may be throughout
 BEATS, SWEPT = 1.5, 0.33  # once the samples have slid over the polls so often the envelope is known by so much better
-LEVEL = 0.38  # error of the envelope's level by that of slope times span
+LEVEL, WAVES_LEVEL = 0.5, 0.38  # error of the envelope's level by that of slope times span: steady, or in waves
+STEADY = 2.5  # the lowest arrivals lie no further from the line than so many times what they do by chance
 COARSE_LEVEL = 0.012  # of the period of a latency timer: how far its beat with finer polls moves the floor
 GAP_SIGMA = 0.5  # of the gap between the samples' phases that may hide the floor
 LAW_ERROR = 0.012  # of the mean delay times the law's shape, times the shape again but at least 2: see docs/clocks.md
@@ -174,7 +175,9 @@ def envelope_by_data(x: Floats, y: Floats, prior: SlopePrior | None = None) -> C
         limit_ns = CLEAR * float(np.median(y - curve.at(x)))
     usual, unsure = touching_error(low_y - curve.at(low_x), curve.knots_x.size - 1)
     lowest = min(LOWEST * float(np.median(y - curve.at(x))) / math.sqrt(x.size), usual)
-    return replace(curve, sigma_ns=math.hypot(LEVEL * unsure, lowest, ARRIVAL_NS))
+    few = FEW * float(np.median(y - curve.at(x))) / math.sqrt(x.size / BLOCKS)
+    steady = curve.knots_x.size == 2 and usual < STEADY * few
+    return replace(curve, sigma_ns=math.hypot((LEVEL if steady else WAVES_LEVEL) * unsure, lowest, ARRIVAL_NS))
 
 
 def grid_points(x: Floats, y: Floats, slope: float) -> tuple[list[GridPoints], float, float]:
@@ -234,7 +237,7 @@ def grid_curve(x: Floats, y: Floats, beneath: Curve, prior: SlopePrior | None) -
     variance = np.linalg.inv(information).diagonal()[: knots_x.size]
     sd_ns = math.sqrt(max(float(np.median(variance)), 0.0))
     usual_low = usual_low_ns(x.size, period, mean)
-    few = usual_low**2 / (FEW_ERROR * mean)
+    few = min(BIAS * mean / x.size, sd_ns)
     sigma = math.hypot(sd_ns, few, law_error, jitter, GAP_SIGMA * gap)
     # what is left of the envelope's own error
     unseen = gap if period >= COARSE_NS else period - float(np.mod(np.maximum(height, 0.0), period).max())

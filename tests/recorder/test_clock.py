@@ -237,6 +237,19 @@ def test_uncertainty_is_true_and_not_too_wide(kind: dict[str, float]) -> None:
     assert 2 * sigma.mean() < 4 * np.quantile(off, 0.95)
 
 
+@pytest.mark.parametrize("kind", [{"jitter_ms": 0.3}, {"poll_ms": 1.0, "jitter_ms": 0.7}, {"poll_ms": 16.0}])
+def test_uncertainty_of_refined_times_is_true_and_not_too_wide(kind: dict[str, float]) -> None:
+    off_ns, sigma_ns = [], []
+    for seed in range(1, 9):
+        t = trace(seed=seed, duration_s=60.0, skew_ppm=15.0 * seed, **kind)
+        refined = refine_all(t.ticks, t.arrival_ns, 1e6)
+        off_ns.append(np.abs(refined.host_ns - t.true_ns))
+        sigma_ns.append(refined.sigma_ns)
+    off, sigma = np.concatenate(off_ns), np.concatenate(sigma_ns)
+    assert np.mean(off <= 2 * sigma) > 0.9
+    assert 2 * sigma.mean() < 4 * np.quantile(off, 0.95)
+
+
 def test_two_way_pairs_tell_the_floor() -> None:
     t = trace(duration_s=20.0)
     floor_ns = 3 * MS
