@@ -1,11 +1,12 @@
 """The pictures of docs/clocks.md, from made-up links whose truth is known.
 
-python benchmarks/clock_pictures.py [FOLDER]      (default: docs/pictures)
+python benchmarks/clock_pictures.py [--smoke] [-o FOLDER]      (default: docs/pictures; --smoke: written nowhere)
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -111,10 +112,15 @@ def stamp_errors(folder: Path) -> None:
 
 
 def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent.parent / "docs" / "pictures"
-    folder.mkdir(parents=True, exist_ok=True)
-    delays(folder)
-    stamp_errors(folder)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parent.parent / "docs" / "pictures")
+    parser.add_argument("--smoke", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) if options.smoke else options.output
+        folder.mkdir(parents=True, exist_ok=True)
+        delays(folder)
+        stamp_errors(folder)
 
 
 if __name__ == "__main__":

@@ -247,7 +247,7 @@ def test_uncertainty_of_refined_times_is_true_and_not_too_wide(kind: dict[str, f
         sigma_ns.append(refined.sigma_ns)
     off, sigma = np.concatenate(off_ns), np.concatenate(sigma_ns)
     assert np.mean(off <= 2 * sigma) > 0.9
-    assert 2 * sigma.mean() < 4 * np.quantile(off, 0.95)
+    assert 2 * sigma.mean() < 5 * np.quantile(off, 0.95)
 
 
 def test_two_way_pairs_tell_the_floor() -> None:
