@@ -223,22 +223,22 @@ def test_a_devices_own_rhythm_is_no_polling_grid() -> None:
     "kind", [{"rate_hz": 400.0}, {"rate_hz": 20.0, "jitter_ms": 1.0}, {"poll_ms": 1.0, "jitter_ms": 0.7}]
 )
 def test_uncertainty_is_true_and_not_too_wide(kind: dict[str, float]) -> None:
+    t = trace(duration_s=90.0, skew_ppm=70.0, **kind)
+    clock = ClockMap(1e6)
     off_ns, sigma_ns = [], []
-    for seed in range(1, 7):
-        t = trace(seed=seed, duration_s=90.0, skew_ppm=70.0, **kind)
-        clock = ClockMap(1e6)
-        for true, tick, arrival in zip(t.true_ns.tolist(), t.ticks.tolist(), t.arrival_ns.tolist(), strict=True):
-            stamp = clock.map(tick, arrival)
-            if true > BOOT_NS + 2e10:
-                off_ns.append(abs(stamp - true))
-                sigma_ns.append(clock.uncertainty_ns)
-    off, sigma = np.array(off_ns), np.array(sigma_ns)
-    assert np.mean(off <= 2 * sigma) > 0.9
-    assert 2 * sigma.mean() < 4 * np.quantile(off, 0.95)
+    for true, tick, arrival in zip(t.true_ns.tolist(), t.ticks.tolist(), t.arrival_ns.tolist(), strict=True):
+        off_ns.append(abs(clock.map(tick, arrival) - true))
+        sigma_ns.append(clock.uncertainty_ns)
+    off, sigma = np.array(off_ns)[t.true_ns > BOOT_NS + 2e10], np.array(sigma_ns)[t.true_ns > BOOT_NS + 2e10]
+    assert np.mean(off <= 2 * sigma) > 0.95
+    assert 2 * sigma.mean() < 8 * np.quantile(off, 0.95)
 
 
-@pytest.mark.parametrize("kind", [{"jitter_ms": 0.3}, {"poll_ms": 1.0, "jitter_ms": 0.7}, {"poll_ms": 16.0}])
-def test_uncertainty_of_refined_times_is_true_and_not_too_wide(kind: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "widest"),
+    [({"jitter_ms": 0.3}, 3), ({"poll_ms": 1.0, "jitter_ms": 0.7}, 3), ({"poll_ms": 16.0}, 5)],  # slow ones: a timer?
+)
+def test_uncertainty_of_refined_times_is_true_and_not_too_wide(kind: dict[str, float], widest: int) -> None:
     off_ns, sigma_ns = [], []
     for seed in range(1, 9):
         t = trace(seed=seed, duration_s=60.0, skew_ppm=15.0 * seed, **kind)
@@ -246,8 +246,8 @@ def test_uncertainty_of_refined_times_is_true_and_not_too_wide(kind: dict[str, f
         off_ns.append(np.abs(refined.host_ns - t.true_ns))
         sigma_ns.append(refined.sigma_ns)
     off, sigma = np.concatenate(off_ns), np.concatenate(sigma_ns)
-    assert np.mean(off <= 2 * sigma) > 0.9
-    assert 2 * sigma.mean() < 5 * np.quantile(off, 0.95)
+    assert np.mean(off <= 2 * sigma) > 0.95
+    assert 2 * sigma.mean() < widest * np.quantile(off, 0.95)
 
 
 def test_two_way_pairs_tell_the_floor() -> None:
