@@ -137,21 +137,16 @@ class PollingGrid:
 
         def hidden(slope: float) -> Hidden:
             gap = widest_gap(events_x * (1 + slope), period)
-            return (
-                Hidden(gap, gap) if period < COARSE_NS else Hidden(max(COARSE_GAP * gap, COARSE_ERROR * period), period)
-            )
+            if period < COARSE_NS:
+                return Hidden(gap, gap)
+            return Hidden(max(COARSE_GAP * gap, COARSE_ERROR * period), period)
 
         return hidden
 
     def height_ns(self, samples: float, spread_ns: float) -> float:
-        """How far above the floor the lowest of so many polled arrivals usually is; 0 without polls or with slow ones.
-
-        Of delays that begin like a gamma law of shape 2 and scale s, samples * d^3 / (6 s^2 period) are less than d
-        late when they are seen.
-        """
-        if self.period_ns >= COARSE_NS:
-            return 0.0  # `hides` says more of latency timers
-        return math.cbrt(1.5 * spread_ns**2 * self.period_ns / max(samples, 1.0))
+        """`usual_low_ns` by what is known now; 0 without polls, or with slow ones, of which `hides` says more."""
+        period = self.period_ns
+        return usual_low_ns(samples, period, spread_ns) if period < COARSE_NS else 0.0
 
     def unseen_ns(self, age_s: float) -> float:
         """One sigma of the height above the floor that the polls may hide from a line under the arrivals.
@@ -358,6 +353,15 @@ def widest_gap(events: Floats, period: float) -> float:
     """Of the phases of the samples against the polls: so far the floor may be hidden from the lowest arrivals."""
     phase = np.sort(events % period)
     return float(np.diff(phase, append=phase[0] + period).max())
+
+
+def usual_low_ns(samples: float, period: float, mean_ns: float) -> float:
+    """How far above the floor the lowest arrivals usually are when they had to wait for a poll.
+
+    With n delays that begin like a gamma law of shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less
+    than d late.  Of laws that begin steeply more are, and the lowest lie closer together than that.
+    """
+    return math.cbrt(1.5 * mean_ns**2 * period / max(samples, 1.0))
 
 
 def ramp(value: float, good: float, bad: float) -> float:

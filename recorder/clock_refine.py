@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from recorder.clock_fit import BLOCKS, FEW, MOST_SKEW, PPM, Floats, Level, SlopePrior, hull_slope, touching_error
 from recorder.clock_grid import GAMMA, LAW_PRIOR, DelayLaw, Fitted, GridPoints, GridTracker, IntervalFit, snap
-from recorder.clock_polling import COARSE_NS, judge, on_coarser_grid, ramp, spreads_over_polls, widest_gap, without_late
+from recorder.clock_polling import (
+    COARSE_NS,
+    judge,
+    on_coarser_grid,
+    ramp,
+    spreads_over_polls,
+    usual_low_ns,
+    widest_gap,
+    without_late,
+)
 
 Ints = NDArray[np.int64]
 
@@ -39,7 +48,7 @@ CHUNK_ARRIVALS = 40
 FREE = 1e-20
 ARRIVAL_NS = 250.0  # how well an arrival can be stamped at best
 LOWEST = 1.0  # of the median delay by the root of their number: how late the quickest is, for gamma laws of shape 2
-FEW_LOWEST = 40
+FEW_LOWEST = 40  # arrivals that tell by their distance from each other how close the lowest one is to the floor
 BIAS = 400.0  # of the mean delay, by the number of samples: how wrong the place by the law may be throughout
 BEATS, SWEPT = 1.5, 0.33  # once the samples have slid over the polls so often the envelope is known by so much better
 LEVEL, WAVES_LEVEL = 0.5, 0.38  # error of the envelope's level by that of slope times span: steady, or in waves
@@ -174,8 +183,9 @@ def envelope_by_data(x: Floats, y: Floats, prior: SlopePrior | None = None) -> C
         curve = envelope(low_x, low_y, knots(low_x[0], low_x[-1], spacing_s), prior)
         limit_ns = CLEAR * float(np.median(y - curve.at(x)))
     usual, unsure = touching_error(low_y - curve.at(low_x), curve.knots_x.size - 1)
-    lowest = min(LOWEST * float(np.median(y - curve.at(x))) / math.sqrt(x.size), usual)
-    few = FEW * float(np.median(y - curve.at(x))) / math.sqrt(x.size / BLOCKS)
+    spread = float(np.median(y - curve.at(x)))
+    lowest = min(LOWEST * spread / math.sqrt(x.size), usual)
+    few = FEW * spread / math.sqrt(x.size / BLOCKS)
     steady = curve.knots_x.size == 2 and usual < STEADY * few
     return replace(curve, sigma_ns=math.hypot((LEVEL if steady else WAVES_LEVEL) * unsure, lowest, ARRIVAL_NS))
 
@@ -274,15 +284,6 @@ def beats(event: Floats, period: float) -> float:
     """How often the samples have slid over all of the period."""
     step = np.diff(event % period)
     return abs(float((step - np.rint(step / period) * period).sum())) / period
-
-
-def usual_low_ns(samples: int, period: float, mean_ns: float) -> float:
-    """How far above the floor the lowest arrivals usually are when they had to wait for a poll.
-
-    With n delays that begin like a gamma law of shape 2 and scale s, n d^3 / (6 s^2 period) of the arrivals are less
-    than d late.  Of laws that begin steeply more are, and the lowest lie closer together than that.
-    """
-    return math.cbrt(1.5 * mean_ns**2 * period / samples)
 
 
 def _trust(problem: IntervalFit, fitted: Fitted, x: Floats, points: list[GridPoints], sd_ns: float) -> float:
